@@ -17,6 +17,7 @@ Prints a table of each error, or of the named ones, and writes ``accuracy.jsonl`
 """
 
 import argparse
+import functools
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,8 +32,9 @@ from bench.cases import RADIUS, SATURATION, touching_pile
 from bench.machine import describe
 from bench.reference import clusters, magnet_pairs, oracle, spheres
 from bench.reference.fall import DURATION, fall
-from bench.run import RUNNERS, make_system, relative
-from bench.systems import moment_system
+from bench.reference.oracle import relative
+from bench.run import RUNNERS, make_system
+from bench.systems import moment_system, solve_cold
 from bench.timing import measure
 from warpmag.declarations.magnets import CONTACT_MODELS
 from warpmag.moments.system import MomentSystem
@@ -46,10 +48,8 @@ GAPS = (0.01, 0.03, 0.1, 0.3, 0.5, 0.9, 1.2, 3.0)
 """Gaps between two balls over their radius."""
 SIDE, BOX_GAPS, MAGNETIZATION = 0.02, (0.0, 0.01, 0.05, 0.2, 0.5, 1.0, 2.0), 1e6
 """Longest edge of box magnets [m], gaps between two of them over it, and their magnetization along z [A/m]."""
-PILES = (2500, 10000)
-"""Balls of the piles on which the near-contact model is timed."""
-STEPS = (4e-4, 2e-4, 1e-4, 5e-5)
-"""Time steps [s]."""
+PILES = (2500, 10000)  # balls of the piles on which the near-contact model is timed
+STEPS = (4e-4, 2e-4, 1e-4, 5e-5)  # time steps [s]
 
 
 def rounding(device) -> Iterator[dict]:
@@ -77,12 +77,7 @@ def iteration(device) -> Iterator[dict]:
                 device=device,
             )  # fmt: skip
             system.positions.assign(x)
-
-            def cold(system=system):
-                system.start_cold()
-                system.solve()
-
-            milliseconds = 1e3 * measure(cold, device)
+            milliseconds = 1e3 * measure(functools.partial(solve_cold, system), device)
             error = relative(system.magnetizations().numpy(), exact)
             evaluations = int(system.evaluations.numpy()[0])
             yield {"dtype": dtype, "rtol": rtol, "evaluations": evaluations, "ms": milliseconds, "error": error}
@@ -114,7 +109,8 @@ def model(device) -> Iterator[dict]:
                 x = RADIUS * np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0 + gap]])
                 h0 = field * np.array(direction)
                 exact = _exact_pair_force(RADIUS * (2.0 + gap), permeability, m, field)
-                ratios = {kind: _pair_force(x, h0, permeability, kind, device) / exact for kind in CONTACT_MODELS}
+                systems = {kind: _solve(x, h0, permeability, kind, device) for kind in CONTACT_MODELS}
+                ratios = {kind: float(system.forces.numpy()[1, 2]) / exact for kind, system in systems.items()}
                 yield {"field": name, "permeability": permeability, "gap": gap, **ratios}
 
 
@@ -123,10 +119,6 @@ def _exact_pair_force(distance, permeability, m, field) -> float:
     pair = spheres.pair(distance, (RADIUS, RADIUS), (permeability, permeability))
     moments = np.linalg.solve(pair.resistance[m], [field, field])
     return float(-0.5 * oracle.MU0 * moments @ pair.slope[m] @ moments)
-
-
-def _pair_force(positions, field, permeability, contact_model, device) -> float:
-    return float(_solve(positions, field, permeability, contact_model, device).forces.numpy()[1, 2])
 
 
 def _solve(positions, field, permeability, contact_model, device) -> MomentSystem:
@@ -177,8 +169,8 @@ def _box_force(half1, half2, offset, device) -> tuple[np.ndarray, int]:
     """Force [N] on the second of two boxes magnetized along z, and the number of moments of both."""
     builder = newton.ModelBuilder()
     warpmag.register_attributes(builder)
-    for half, place in ((half1, np.zeros(3)), (half2, offset)):
-        body = builder.add_body(xform=wp.transform(wp.vec3(*place), wp.quat_identity()))
+    for half, center in ((half1, np.zeros(3)), (half2, offset)):
+        body = builder.add_body(xform=wp.transform(wp.vec3(*center), wp.quat_identity()))
         builder.add_shape_box(body, hx=half[0], hy=half[1], hz=half[2])
         warpmag.add_permanent(builder, body, magnetization=(0.0, 0.0, MAGNETIZATION))
     model = builder.finalize(device=device)
@@ -221,13 +213,10 @@ ERRORS = {
 
 def print_table(rows: list[dict]) -> None:
     """Print rows with equal keys as a table."""
-    head = list(rows[0])
-    cells = [
-        head,
-        *[[f"{row[key]:.3g}" if isinstance(row[key], float) else str(row[key]) for key in head] for row in rows],
-    ]
-    widths = [max(len(line[column]) for line in cells) for column in range(len(head))]
-    for line in cells:
+    lines = [list(rows[0])]
+    lines += [[f"{value:.3g}" if isinstance(value, float) else str(value) for value in row.values()] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    for line in lines:
         print("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)))
 
 
@@ -259,10 +248,8 @@ def _draw_model(axis, rows) -> None:
 def _draw_clusters(axis, rows) -> None:
     for kind, style in zip(CONTACT_MODELS, ("--", "-"), strict=True):
         for cluster in clusters.FIELDS:
-            worst = [
-                max(row[kind] for row in rows if (row["cluster"], row["gap"]) == (cluster, gap))
-                for gap in clusters.GAPS
-            ]
+            part = [row for row in rows if row["cluster"] == cluster]
+            worst = [max(row[kind] for row in part if row["gap"] == gap) for gap in clusters.GAPS]
             axis.loglog(clusters.GAPS, worst, style, label=f"{kind}, {cluster}, the worst of μr and fields")
     axis.set(xlabel="gap over radius", ylabel="relative error of forces")
 

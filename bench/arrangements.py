@@ -5,7 +5,7 @@ under a dipole, where one end saturates and the other is hardly magnetized.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,25 +14,17 @@ from bench.reference import oracle
 from bench.systems import moment_system
 from warpmag.moments.system import MomentSystem
 
-TILTED = np.array([0.48, 0.6, 0.64])
-"""Direction of uniform fields, oblique to all axes of an arrangement."""
+TILTED = np.array([0.48, 0.6, 0.64])  # direction of uniform fields, oblique to all axes of an arrangement
 
 
 @dataclass(frozen=True)
 class Arrangement:
-    """Balls in a field.
+    """Balls in a field."""
 
-    Attributes:
-        positions: Centers [m], shape [n, 3], exact in float32.
-        applied: Applied field [A/m], shape [n, 3].
-        radii: Radii [m], scalar or [n].
-        material: Material arguments of a solve.
-    """
-
-    positions: np.ndarray
-    applied: np.ndarray
-    radii: float | np.ndarray = RADIUS
-    material: dict = field(default_factory=lambda: {"saturation": SATURATION})
+    positions: np.ndarray  # centers [m], shape [n, 3], exact in float32
+    applied: np.ndarray  # applied field [A/m], shape [n, 3]
+    radii: float | np.ndarray  # [m], scalar or [n]
+    material: dict  # material arguments of a solve
 
 
 def _chain(count):
@@ -73,20 +65,13 @@ def _heap(count):
     return x[np.argsort(height, kind="stable")[:count]]
 
 
-def _heap_with_ten_in_one():
-    """A heap with its last ten balls at the position of another ball."""
-    x = _heap(120)
-    x[-10:] = x[20]
-    return x
-
-
 def _loose(count, extent, seed=0):
     """Balls at random in a cube, some of them overlapping."""
     return extent * np.random.default_rng(seed).uniform(-0.5, 0.5, (count, 3))
 
 
 def _uniform(positions, strength, radii=RADIUS, **material):
-    """Arrangement in a tilted uniform field, ``strength`` times the saturation."""
+    """Arrangement in a tilted uniform field of ``strength`` times the saturation."""
     x = np.asarray(positions, np.float32).astype(float)
     applied = np.broadcast_to(strength * SATURATION * TILTED, x.shape)
     return Arrangement(x, applied, radii, {"saturation": SATURATION, **material})
@@ -96,8 +81,8 @@ def _dipole(positions, moment, **material):
     """Arrangement under a dipole [A·m²], two centimeters above its top and off its middle."""
     x = np.asarray(positions, np.float32).astype(float)
     middle = x.mean(axis=0)
-    place = np.array([middle[0] + 0.003, middle[1] + 0.001, x[:, 2].max() + 0.02])
-    applied = oracle.h_field(place[None], np.array([[0.2 * moment, 0.0, moment]]), x)
+    source = np.array([[middle[0] + 0.003, middle[1] + 0.001, x[:, 2].max() + 0.02]])
+    applied = oracle.h_field(source, np.array([[0.2 * moment, 0.0, moment]]), x)
     return Arrangement(x, applied, RADIUS, {"saturation": SATURATION, **material})
 
 
@@ -129,7 +114,7 @@ ARRANGEMENTS: dict[str, Callable[[], Arrangement]] = {
     "pile under a strong dipole": lambda: _dipole(_grid(5, 5, 5), 900.0),
     "pile of a weak material": lambda: _dipole(_grid(5, 5, 5), 60.0, susceptibility=3.0),
     "bar": lambda: _uniform(_grid(14, 3, 3), 0.1),
-    "heap, ten balls in one": lambda: _uniform(_heap_with_ten_in_one(), 0.1),
+    "heap, eleven balls at one position": lambda: _uniform(_heap(120)[[*range(110), *[20] * 10]], 0.1),
     "materials side by side": _mixed,
     "loose balls": lambda: _uniform(_loose(120, 0.12), 0.1),
     "overlapping balls": lambda: _uniform(_loose(120, 0.05), 0.1),
@@ -147,9 +132,7 @@ def arranged(balls: Arrangement, **settings) -> MomentSystem:
 def trace(system: MomentSystem, *, to_residual: bool = False) -> np.ndarray:
     """Solve, and return the residual e_M (Eq. 12) after each field evaluation.
 
-    Args:
-        system: The system.
-        to_residual: End when the residual is at most ``rtol``, or not finite, in place of the solve's own criterion.
+    With ``to_residual`` the solve ends when the residual is at most ``rtol`` or not finite, else by its own criterion.
     """
     residuals, ended = [], False
     system.begin()

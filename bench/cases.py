@@ -4,26 +4,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-RADIUS = 0.005
-"""Ball radius of every case [m]."""
-SATURATION = 1.7e6
-"""Saturation magnetization of every case [A/m]."""
+RADIUS = 0.005  # ball radius of every case [m]
+SATURATION = 1.7e6  # saturation magnetization of every case [A/m]
 
 
 @dataclass(frozen=True)
 class Case:
-    """One benchmark.
+    """One benchmark."""
 
-    Attributes:
-        name: Name on the command line.
-        summary: Quantity that is timed.
-        sizes: Numbers of balls on a CPU and on a GPU.
-        dtypes: Precisions.
-    """
-
-    name: str
-    summary: str
-    sizes: dict[str, tuple[int, ...]]
+    name: str  # on the command line
+    summary: str  # quantity that is timed
+    sizes: dict[str, tuple[int, ...]]  # numbers of balls on a CPU and on a GPU
     dtypes: tuple[str, ...] = ("float32",)
 
 

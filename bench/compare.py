@@ -21,8 +21,7 @@ from bench.peers import PEERS, Peer
 from bench.reference import oracle
 
 SIZES = {"cpu": (243, 1032, 2560, 10000, 20000), "cuda": (243, 1032, 2560, 10000, 32768, 131072, 262144)}
-_CHECKED = 32
-"""Number of targets compared with the oracle."""
+_CHECKED = 32  # number of targets compared with the oracle
 _LAPS = 7
 
 
@@ -64,27 +63,31 @@ class Measurement:
         self._evaluation.wait()
         self._times.append((time.perf_counter() - start) / self._evaluations)
 
-    def result(self, expected) -> dict:
-        """Times of an evaluation, and the error of its field."""
-        targets, fields = expected
+    def result(self, targets, expected) -> dict:
+        """Times of an evaluation, and the errors of its field at the targets."""
         best = min(self._times)
         return {
             "seconds": best,
             "median_seconds": float(np.median(self._times)),
             "pairs_per_second": self._pairs / best,
-            "error": float(np.linalg.norm(self._evaluation.result()[targets] - fields) / np.linalg.norm(fields)),
+            **errors(self._evaluation.result()[targets], expected),
             "first_call_seconds": self._first,
         }
 
 
-def compare(peers: list[Peer], count: int, device: str, seconds: float) -> dict[str, dict]:
-    """Measure peers at one size, lap by lap in turns, so that other load of the machine affects all of them.
+def errors(values, expected) -> dict:
+    """RMS error and largest error of vectors, shape [rows, 3], over the RMS of the expected ones."""
+    distance = np.linalg.norm(values - expected, axis=1)
+    mean = np.sqrt((expected**2).sum() / len(expected))
+    return {"error": float(np.sqrt((distance**2).mean()) / mean), "largest_error": float(distance.max() / mean)}
 
-    Returns:
-        The values of each peer's line, by name.
+
+def compare(peers: list[Peer], positions, moments, exact, device: str, seconds: float) -> dict[str, dict]:
+    """Measure peers, lap by lap in turns, so that other load of the machine affects all of them.
+
+    ``exact`` are the indices of some targets and the exact fields at them. Returns the values of each peer's line by
+    its name, or ``failed`` and the error.
     """
-    positions, moments = arrays(count)
-    expected = reference(positions, moments)
     running, lines = {}, {}
 
     def attempt(name, call, *arguments):
@@ -100,7 +103,7 @@ def compare(peers: list[Peer], count: int, device: str, seconds: float) -> dict[
         for name in [name for name in running if name not in lines]:
             attempt(name, running[name].lap)
     for name in [name for name in running if name not in lines]:
-        result = attempt(name, running[name].result, expected)
+        result = attempt(name, running[name].result, *exact)
         lines[name] = result or lines[name]
     return {name: lines[name] for name in running}
 
@@ -113,24 +116,21 @@ def main(arguments=None) -> None:
         description=__doc__.partition("\n")[0],
         epilog="peers: " + "; ".join(f"{name} ({peer.summary})" for name, peer in choices.items()),
     )
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--sizes", type=int, nargs="+", help="numbers of dipoles; default by device")
-    parser.add_argument("--peers", nargs="+", choices=choices, default=choices, help="default: all")
-    parser.add_argument("--seconds", type=float, default=0.3, help="time for each measurement (default 0.3)")
-    parser.add_argument(
-        "--slowest",
-        type=float,
-        default=0.1,
-        help="seconds of an evaluation beyond which larger sizes are skipped (0.1)",
-    )
-    parser.add_argument("-o", "--output", type=Path, help="file that the lines are appended to")
+    add = parser.add_argument
+    add("--device", default="cpu")
+    add("--sizes", type=int, nargs="+", help="numbers of dipoles; default by device")
+    add("--peers", nargs="+", choices=choices, default=choices, help="default: all")
+    add("--seconds", type=float, default=0.3, help="time for each measurement (default 0.3)")
+    add("--slowest", type=float, default=0.1, help="seconds beyond which larger sizes are skipped (0.1)")
+    add("-o", "--output", type=Path, help="file that the lines are appended to")
     options = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
     device = wp.get_device(options.device)
     kind, write = "cpu" if device.is_cpu else "cuda", line_writer(device, options.output)
     peers = [choices[name] for name in options.peers if kind in choices[name].devices]
     for count in options.sizes or SIZES[kind]:
-        lines = compare(peers, count, str(device), options.seconds)
+        positions, moments = arrays(count)
+        lines = compare(peers, positions, moments, reference(positions, moments), str(device), options.seconds)
         for name, line in lines.items():
             write({"case": "compare", "peer": name, "count": count} | line)
             if "failed" in line:

@@ -7,24 +7,26 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
-CLOCKS = {"NVIDIA H200": 1.98e9}
-"""Clock of GPUs under load [Hz]."""
-_LANES = 128
-"""Float32 operations that a multiprocessor of these GPUs starts per cycle."""
+import warp as wp
+
+_CLOCKS = {"NVIDIA H200": 1.98e9}  # clock of GPUs under load [Hz]
+_LANES = 128  # float32 operations that a multiprocessor of these GPUs starts per cycle
 
 
 def describe(device) -> dict:
-    """Return machine, device, versions and commit of a measurement on a Warp device."""
-    import warp as wp  # noqa: PLC0415 - callers configure Warp before it is imported
+    """Return machine, device, versions and commit of a measurement on a Warp device.
 
+    ``operations_per_second`` are those in float32 that a GPU can start; None for a CPU and for GPUs of unknown clock.
+    """
     device = wp.get_device(device)
+    known = device.is_cuda and device.name in _CLOCKS
     return {
         "commit": _commit(),
         "device": device.name if device.is_cuda else "cpu",
         "machine": f"{_processor()}, {os.cpu_count()} cores",
         "python": platform.python_version(),
         "warp": wp.__version__,
-        "operations_per_second": operations_per_second(device),
+        "operations_per_second": device.sm_count * _LANES * _CLOCKS[device.name] if known else None,
     }
 
 
@@ -43,12 +45,6 @@ def line_writer(device, output: Path | None = None) -> Callable[[dict], None]:
     return write
 
 
-def operations_per_second(device) -> float | None:
-    """Float32 operations per second that a GPU can start; None for a CPU and for GPUs that are not in ``CLOCKS``."""
-    known = device.is_cuda and device.name in CLOCKS
-    return device.sm_count * _LANES * CLOCKS[device.name] if known else None
-
-
 def _processor() -> str:
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -59,12 +55,10 @@ def _processor() -> str:
 
 def _commit() -> str:
     """Short hash of the checkout, with ``+`` for uncommitted changes; outside a checkout ``WARPMAG_COMMIT``."""
-    folder = Path(__file__).parent
 
     def git(*arguments):
-        return subprocess.run(
-            ["git", "-C", folder, *arguments], capture_output=True, text=True, check=True
-        ).stdout.strip()
+        command = ["git", "-C", Path(__file__).parent, *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
     try:
         changed = git("status", "--porcelain", "--untracked-files=no", "--", "..")

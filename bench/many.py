@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
+from bench.compare import compare, errors
 from bench.machine import line_writer
 from bench.peers import PEERS, Peer
 from bench.report import machine_of, read
@@ -31,41 +32,36 @@ SIZES = {
     "cpu": (1_000, 2_197, 4_913, 10_648, 21_952, 50_653, 97_336),
     "cuda": (1_000, 4_913, 10_648, 21_952, 32_768, 50_653, 97_336, 205_379, 512_000, 1_000_000, 2_048_383, 4_019_679),
 }
-RTOLS = (None, 1e-3, 1e-5)
-"""Requested relative errors; None means all pairs."""
-_SPACING = 0.005
-"""Lattice spacing [m]."""
-_CHECKED = 100
-"""Number of moments at which errors are measured."""
+RTOLS = (None, 1e-3, 1e-5)  # requested relative errors; None means all pairs
+_SPACING = 0.005  # lattice spacing [m]
+_CHECKED = 100  # number of moments at which errors are measured
 
 
 class Moments:
-    """Moments on a device, and the arrays of their sums.
+    """Moments on a device, and the arrays of their sums."""
 
-    Args:
-        places: Positions [m], shape [n, 3].
-        moments: Moments [A·m²], shape [n, 3].
-        dtype: Warp scalar type.
-        device: Warp device.
-    """
-
-    def __init__(self, places, moments, dtype, device):
-        """Copy the arrays to the device."""
-        n, vec3 = len(places), wp.types.vector(3, dtype)
-        x, m = (wp.array(values, dtype=vec3, device=device) for values in (places, moments))
+    def __init__(self, positions, moments, dtype, device):
+        """Copy positions [m] and moments [A·m²], shape [n, 3], to the device."""
+        n, vec3 = len(positions), wp.types.vector(3, dtype)
+        x, m = (wp.array(values, dtype=vec3, device=device) for values in (positions, moments))
         self.packed = PackedMoments(wp.zeros(n, dtype=dtype, device=device), largest_radius=0.0, moving=False)
         self.packed.pack(x, m)
         self._base, self.out, self._torques = (wp.zeros_like(x) for _ in range(3))
-        self._turned = wp.ones(n, dtype=int, device=device)
+        self._with_torque = wp.ones(n, dtype=int, device=device)
 
     def evaluation(self, quantity: Quantity, rows=None, sums=None) -> PairEvaluation:
         """Evaluation of a quantity into ``out``: at some rows only, or by ``sums`` in place of all pairs."""
         n = self.packed.count
         segments = [(0, n, 0, n)] if rows is None else [(row, row + 1, 0, n) for row in rows]
         return PairEvaluation(
-            quantity, segments, self.packed, self.packed, self._base, self.out, with_torque=self._turned,
+            quantity, segments, self.packed, self.packed, self._base, self.out, with_torque=self._with_torque,
             torques=self._torques, sums=sums, ranks=current_ranks(),
         )  # fmt: skip
+
+    def values(self, quantity: Quantity, rows) -> np.ndarray:
+        """Sums over all pairs at some rows, shape [rows, 3]."""
+        self.evaluation(quantity, rows).launch()
+        return self.out.numpy()[rows]
 
     def parts(self, quantity: Quantity, rtol: float | None) -> tuple[Callable[[], None], Callable[[], None]]:
         """Functions that build the cells of moments that have moved, and that evaluate a quantity into ``out``.
@@ -77,16 +73,6 @@ class Moments:
         fast = FastSums(self.packed, rtol)
         return fast.build, self.evaluation(quantity, sums=fast.sums(quantity)).launch
 
-    def work(self, quantity: Quantity, rtol: float | None) -> Callable[[], None]:
-        """Function that does both parts."""
-        build, evaluate = self.parts(quantity, rtol)
-
-        def build_and_evaluate():
-            build()
-            evaluate()
-
-        return build_and_evaluate
-
 
 def repetitions(count: int) -> dict:
     """Arguments of ``measure`` for a number of moments: few repetitions where the launch of a graph is negligible."""
@@ -97,41 +83,37 @@ def lattice(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions [m] and moments [A·m²] of the first ``count`` sites, the same in every run, float32, shape [n, 3]."""
     random, side = np.random.default_rng(1), int(np.ceil(count ** (1 / 3) - 1e-9))
     sites = np.stack(np.meshgrid(*3 * [np.arange(side)], indexing="ij"), axis=-1).reshape(-1, 3)[:count]
-    places = _SPACING * (sites + random.uniform(-0.15, 0.15, sites.shape))
-    return places.astype(np.float32), random.normal(size=sites.shape).astype(np.float32)
+    positions = _SPACING * (sites + random.uniform(-0.15, 0.15, sites.shape))
+    return positions.astype(np.float32), random.normal(size=sites.shape).astype(np.float32)
 
 
-def errors(values, expected) -> dict:
-    """RMS error and largest error of vectors, shape [rows, 3], over the RMS of the expected ones."""
-    distance = np.linalg.norm(values - expected, axis=1)
-    mean = np.sqrt((expected**2).sum() / len(expected))
-    return {"error": float(np.sqrt((distance**2).mean()) / mean), "largest_error": float(distance.max() / mean)}
+def _checked_rows(count: int) -> np.ndarray:
+    return np.sort(np.random.default_rng(2).choice(count, min(_CHECKED, count), replace=False))
 
 
 def run_size(count: int, device, slowest: float, seconds: dict):
     """Yield the values of each quantity and method at one size.
 
-    Args:
-        count: Number of moments.
-        device: Warp device.
-        slowest: Expected time [s] beyond which sums over all pairs are skipped.
-        seconds: Times of all pairs by quantity and count; measured times are added.
+    ``seconds`` are the times of all pairs by quantity and count, to which measured times are added. Sums over all pairs
+    are skipped if the time [s] expected from them is longer than ``slowest``.
     """
-    places, moments = lattice(count)
-    rows = np.sort(np.random.default_rng(2).choice(count, min(_CHECKED, count), replace=False))
-    exact = Moments(places.astype(float), moments.astype(float), wp.float64, device)
-    own = Moments(places, moments, wp.float32, device)
+    positions, moments = lattice(count)
+    rows = _checked_rows(count)
+    exact = Moments(positions.astype(float), moments.astype(float), wp.float64, device)
+    single = Moments(positions, moments, wp.float32, device)
     for quantity in (Quantity.FIELD, Quantity.WRENCH):
-        exact.evaluation(quantity, rows).launch()
-        expected = exact.out.numpy()[rows]
+        expected = exact.values(quantity, rows)
+        forecasts = [t * (count / n) ** 2 for (q, n), t in seconds.items() if q == quantity]
         for rtol in RTOLS:
-            began = time.perf_counter()
-            expected_seconds = min(
-                (t * (count / n) ** 2 for (q, n), t in seconds.items() if q == quantity), default=0.0
-            )
-            if rtol is None and expected_seconds > slowest:
+            if rtol is None and min(forecasts, default=0.0) > slowest:
                 continue
-            work = own.work(quantity, rtol)
+            began = time.perf_counter()
+            build, evaluate = single.parts(quantity, rtol)
+
+            def work(build=build, evaluate=evaluate):
+                build()
+                evaluate()
+
             work()
             wp.synchronize_device(device)
             first = time.perf_counter() - began
@@ -139,42 +121,27 @@ def run_size(count: int, device, slowest: float, seconds: dict):
             if rtol is None:
                 seconds[quantity, count] = taken
             line = {"quantity": quantity.name.lower(), "method": "direct" if rtol is None else "fmm", "rtol": rtol}
-            line |= {"count": count, "seconds": taken, **errors(own.out.numpy()[rows], expected)}
+            line |= {"count": count, "seconds": taken, **errors(single.out.numpy()[rows], expected)}
             yield line | {"first_call_seconds": first}
 
 
 def run_peer(peer: Peer, count: int, device) -> dict:
-    """The values of a peer at one size; ``failed`` if the peer fails or its library is missing."""
-    line = {"quantity": "field", "method": peer.name, "rtol": None, "count": count}
-    places, moments = lattice(count)
-    strengths = np.ascontiguousarray(moments[:, 0]) if peer.charges else moments
-    rows = np.sort(np.random.default_rng(2).choice(count, min(_CHECKED, count), replace=False))
-    try:
-        began = time.perf_counter()
-        evaluation = peer.prepare(places, strengths, str(device))
-        evaluation.run()
-        evaluation.wait()
-        first, times = time.perf_counter() - began, []
-        while not times or (sum(times) < 1.0 and len(times) < 20):
-            began = time.perf_counter()
-            evaluation.run()
-            evaluation.wait()
-            times.append(time.perf_counter() - began)
-        fields = evaluation.result()[rows]
-    except Exception as error:  # a peer's failure is a result: the others go on
-        return line | {"failed": f"{type(error).__name__}: {error}".splitlines()[0][:200]}
+    """Values of a peer at one size; ``failed`` if the peer fails or its library is missing."""
+    positions, moments = lattice(count)
+    rows = _checked_rows(count)
     if peer.charges:
-        expected = field_of_charges(places, strengths, rows)
+        strengths = np.ascontiguousarray(moments[:, 0])
+        expected = field_of_charges(positions, strengths, rows)
     else:
-        exact = Moments(places.astype(float), moments.astype(float), wp.float64, device)
-        exact.evaluation(Quantity.FIELD, rows).launch()
-        expected = exact.out.numpy()[rows]
-    return line | {"seconds": float(np.median(times)), **errors(fields, expected), "first_call_seconds": first}
+        strengths, exact = moments, Moments(positions.astype(float), moments.astype(float), wp.float64, device)
+        expected = exact.values(Quantity.FIELD, rows)
+    line = {"quantity": "field", "method": peer.name, "rtol": None, "count": count}
+    return line | compare([peer], positions, strengths, (rows, expected), str(device), 1.0)[peer.name]
 
 
-def field_of_charges(places, charges, rows) -> np.ndarray:
+def field_of_charges(positions, charges, rows) -> np.ndarray:
     """Field Σ q r / 4π|r|³ at some of the charges, shape [rows, 3]."""
-    x, q, fields = places.astype(float), charges.astype(float), []
+    x, q, fields = positions.astype(float), charges.astype(float), []
     for row in rows:
         r = x[row] - x
         cubes = (r**2).sum(axis=1) ** 1.5
@@ -196,18 +163,16 @@ def draw(lines, path: Path) -> None:
         series.setdefault((line["method"], line["rtol"], line["quantity"]), []).append(line)
     methods = sorted({key[:2] for key in series}, key=lambda m: (m[0] not in ("direct", "fmm"), m[0], -(m[1] or 1.0)))
     colors = dict(zip(methods, plt.rcParams["axes.prop_cycle"].by_key()["color"], strict=False))
-    words = {"direct": "all pairs", "fmm": "multipoles"}
+    words = {"direct": "all pairs", "fmm": "multipoles", "field": "field", "wrench": "force, torque"}
     for (method, rtol, quantity), points in series.items():
         style = {"color": colors[method, rtol], "linestyle": "-" if quantity == "field" else "--", "marker": "."}
-        label = f"{words.get(method, method)}{f', rtol {rtol:g}' if rtol else ''}"
+        label = f"{words.get(method, method)}{f', rtol {rtol:g}' if rtol else ''}: {words[quantity]}"
         counts = [line["count"] for line in points]
-        named = f"{label}: {'field' if quantity == 'field' else 'force, torque'}"
-        times.plot(counts, [1e3 * line["seconds"] for line in points], label=named, **style)
+        times.plot(counts, [1e3 * line["seconds"] for line in points], label=label, **style)
         accuracy.plot(counts, [line["error"] for line in points], **style)
-    times.set(xscale="log", yscale="log", xlabel="moments", ylabel="time [ms]")
-    accuracy.set(xscale="log", yscale="log", xlabel="moments", ylabel="relative error")
     times.legend(fontsize="x-small")
-    for axis in (times, accuracy):
+    for axis, quantity in ((times, "time [ms]"), (accuracy, "relative error")):
+        axis.set(xscale="log", yscale="log", xlabel="moments", ylabel=quantity)
         axis.grid(True, alpha=0.3)
     figure.suptitle(f"{machine_of(lines[0])}, commit {lines[0]['commit']}")
     figure.savefig(path, dpi=90, pil_kwargs={"optimize": True})
@@ -218,20 +183,18 @@ def main(arguments=None) -> None:
     """Measure, or draw measured lines."""
     fast = {peer.name: peer for peer in PEERS if peer.charges or peer.name == "fmm3d"}
     parser = argparse.ArgumentParser(prog="python -m bench.many", description=__doc__.partition("\n")[0])
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--sizes", type=int, nargs="+", help="numbers of moments; default by device")
-    parser.add_argument("--peers", nargs="*", choices=fast, default=(), help="besides warpmag; default: none")
-    parser.add_argument(
-        "--slowest", type=float, default=2.0, help="seconds beyond which all pairs and peers get no larger sizes (2)"
-    )
-    parser.add_argument("--draw", type=Path, nargs="+", help="draw these files instead of measuring")
-    parser.add_argument("-o", "--output", type=Path, help="file that lines are appended to, or the picture")
+    add = parser.add_argument
+    add("--device", default="cpu")
+    add("--sizes", type=int, nargs="+", help="numbers of moments; default by device")
+    add("--peers", nargs="*", choices=fast, default=(), help="besides warpmag; default: none")
+    add("--slowest", type=float, default=2.0, help="seconds beyond which all pairs and peers get no larger sizes (2)")
+    add("--draw", type=Path, nargs="+", help="draw these files instead of measuring")
+    add("-o", "--output", type=Path, help="file that lines are appended to, or the picture")
     options = parser.parse_args(arguments)
     if options.draw:
-        kept = {
-            (line["method"], line["rtol"], line["quantity"], line["count"]): line for line in read(options.draw)
-        }  # the last line of each
-        draw(list(kept.values()), options.output or Path("bench_out/many.png"))
+        keys = ("method", "rtol", "quantity", "count")
+        latest = {tuple(line[key] for key in keys): line for line in read(options.draw)}
+        draw(list(latest.values()), options.output or Path("bench_out/many.png"))
         return
     wp.config.log_level = wp.LOG_WARNING
     device, seconds = wp.get_device(options.device), {}

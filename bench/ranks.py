@@ -23,14 +23,14 @@ CASES = ((131_072, None), (1_000_000, None), (1_000_000, 1e-3), (4_019_679, 1e-3
 
 def run_case(count: int, quantity: Quantity, rtol: float | None, all_ranks: Ranks, device) -> dict:
     """Measure the sums of one rank and of all ranks; ``cells_seconds`` is the time to build the cells on every rank."""
-    own = Moments(*lattice(count), wp.float32, device)
+    moments = Moments(*lattice(count), wp.float32, device)
     results = []
     for sharing in (without_ranks(), nullcontext()):
         with sharing:
-            build, evaluate = own.parts(quantity, rtol)
+            build, evaluate = moments.parts(quantity, rtol)
         build()
         evaluate()
-        result = own.out.numpy()
+        result = moments.out.numpy()
         seconds = [measure(part, device, **repetitions(count)) for part in (build, evaluate)]
         results.append((result, np.max(all_ranks.exchange(seconds), axis=0)))
     (single, (cells, seconds_of_one)), (shared, (_, seconds)) = results

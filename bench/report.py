@@ -18,8 +18,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.lines import Line2D
 
-OPERATIONS_PER_PAIR = 20
-"""Operations of a pair in the limit."""
+OPERATIONS_PER_PAIR = 20  # in the limit
 
 
 def read(paths) -> list[dict]:
@@ -29,16 +28,17 @@ def read(paths) -> list[dict]:
 
 def latest(lines) -> list[dict]:
     """The last line of each measurement: files may contain several runs."""
-    kept = {
-        (line["device"], line["case"], line.get("peer", ""), line.get("dtype", ""), line["count"]): line
-        for line in lines
-    }
-    return list(kept.values())
+    keys = ("device", "case", "peer", "dtype", "count")
+    return list({tuple(line.get(key) for key in keys): line for line in lines}.values())
 
 
 def machine_of(line: dict) -> str:
     """Device of a line, or the machine for a CPU."""
     return line["device"] if line["device"] != "cpu" else line["machine"]
+
+
+def _name_of(line: dict) -> str:
+    return line.get("peer") or f"{line['case']} {line['dtype']}"
 
 
 def draw_pareto(lines, path: Path) -> None:
@@ -53,16 +53,10 @@ def draw_pareto(lines, path: Path) -> None:
     for axis in axes.flat[len(sizes) :]:
         axis.set_visible(False)
     for axis, size in zip(axes.flat, sizes, strict=False):
-        for line in lines:
-            if line["count"] == size:
-                marker, scale = ("*", 160) if line["peer"] == "warpmag" else ("o", 40)
-                axis.scatter(
-                    max(line["error"], 1e-16),
-                    line["pairs_per_second"],
-                    scale,
-                    color=colors[line["peer"]],
-                    marker=marker,
-                )
+        for line in (line for line in lines if line["count"] == size):
+            marker, area = ("*", 160) if line["peer"] == "warpmag" else ("o", 40)
+            error, rate = max(line["error"], 1e-16), line["pairs_per_second"]
+            axis.scatter(error, rate, area, color=colors[line["peer"]], marker=marker)
         axis.set(xscale="log", yscale="log", title=f"{size:,} dipoles")
         axis.grid(True, alpha=0.3)
     axes[0, 0].invert_xaxis()
@@ -86,9 +80,7 @@ def draw_roofline(lines, path: Path) -> None:
     figure, axis = plt.subplots(figsize=(7.0, 4.5), layout="constrained")
     series = defaultdict(list)
     for line in lines:
-        series[line.get("peer") or f"{line['case']} {line['dtype']}"].append(
-            (line["count"], line["pairs_per_second"] / limit_of(line))
-        )
+        series[_name_of(line)].append((line["count"], line["pairs_per_second"] / limit_of(line)))
     for name, points in sorted(series.items()):
         axis.plot(*zip(*sorted(points), strict=True), marker="o", label=name, linewidth=3 if name == "warpmag" else 1)
     axis.axhline(1.0, color="black", linewidth=0.8)
@@ -106,14 +98,14 @@ def table(lines) -> str:
         "|---|---|---|---|---|---|---|---|",
     ]
     for line in sorted(lines, key=lambda line: (line["case"], line["count"], line.get("seconds", float("inf")))):
-        name = line.get("peer") or f"{line['case']} {line['dtype']}"
+        head = f"| {_name_of(line)} | {line['count']:,}"
         if "failed" in line:
-            rows.append(f"| {name} | {line['count']:,} | {line['failed']} | | | | | {line['commit']} |")
+            rows.append(f"{head} | {line['failed']} | | | | | {line['commit']} |")
             continue
         rate, limit = line.get("pairs_per_second"), limit_of(line)
         share = f"{rate / limit:.1%}" if rate and limit else ""
         rows.append(
-            f"| {name} | {line['count']:,} | {duration(line['seconds'])} | {f'{rate:.3g}' if rate else ''} | {share} "
+            f"{head} | {duration(line['seconds'])} | {f'{rate:.3g}' if rate else ''} | {share} "
             f"| {line['error']:.1e} | {line['first_call_seconds']:.1f} s | {line['commit']} |"
         )
     return "\n".join(rows)

@@ -6,6 +6,7 @@ balls. Each measurement is one JSON line with machine, commit, error and the tim
 """
 
 import argparse
+import functools
 import time
 
 import numpy as np
@@ -15,16 +16,14 @@ from bench.cases import CASES, RADIUS, SATURATION, Case, touching_pile
 from bench.machine import line_writer
 from bench.reference import oracle
 from bench.scene import run_bundled, run_scene
-from bench.swarm import run_swarm
-from bench.systems import moment_system
+from bench.systems import moment_system, solve_cold
 from bench.timing import measure
-from bench.writing import run_writing
+from bench.writing import run_swarm, run_writing
 from warpmag.moments.system import MomentSystem
 from warpmag.scenes_usd import bundled
 
 _WORLDS = {"cpu": 32, "cuda": 1024}
-_CHECKED = 64
-"""Number of targets compared with the oracle."""
+_CHECKED = 64  # number of targets compared with the oracle
 
 
 def make_system(count: int, dtype: str, device, contact_model: str = "dipole") -> MomentSystem:
@@ -37,46 +36,34 @@ def make_system(count: int, dtype: str, device, contact_model: str = "dipole") -
     return system
 
 
-def oracle_at(system: MomentSystem, rows) -> tuple[np.ndarray, np.ndarray]:
-    """The oracle's field [A/m], without the external field, and force [N] on the moments ``rows`` of a system."""
-    x, m = (a.numpy().astype(float) for a in (system.positions, system.moments))
-    radius = float(system.radii.numpy()[0])
+def oracle_at(x, m, radius, rows) -> tuple[np.ndarray, np.ndarray]:
+    """The oracle's field [A/m] and force [N] of all other moments ``m`` at ``x`` on the moments ``rows``."""
+    x, m = x.astype(float), m.astype(float)
     h, force = np.empty((len(rows), 3)), np.empty((len(rows), 3))
     for k, i in enumerate(rows):
-        others = np.arange(len(x)) != i
-        near = {"radii": radius, "target_radii": radius}
-        h[k] = oracle.h_field(x[others], m[others], x[i : i + 1], **near)
-        force[k] = oracle.kelvin_force(m[i : i + 1], oracle.field_gradient(x[others], m[others], x[i : i + 1], **near))
+        pairs = (np.delete(x, i, 0), np.delete(m, i, 0), x[i : i + 1])
+        h[k] = oracle.h_field(*pairs, radii=radius, target_radii=radius)
+        gradient = oracle.field_gradient(*pairs, radii=radius, target_radii=radius)
+        force[k] = oracle.kelvin_force(m[i : i + 1], gradient)
     return h, force
 
 
-def run_field(system, device) -> dict:
-    """Time one field evaluation, and check its field."""
+def run_sums(system, device, *, forces: bool) -> dict:
+    """Time one evaluation of the field, or of the forces, and compare it with the oracle."""
     rows = np.linspace(0, system.count - 1, min(_CHECKED, system.count)).astype(int)
-    expected, _ = oracle_at(system, rows)
+    field, force = oracle_at(system.positions.numpy(), system.moments.numpy(), system.radii.numpy()[0], rows)
     system.h.zero_()
-    seconds = measure(system.evaluate, device)
-    error = relative(system.h.numpy()[rows] - system.external_field.numpy()[rows], expected)
-    return {"seconds": seconds, "pairs_per_second": system.count**2 / seconds, "error": error}
-
-
-def run_force(system, device) -> dict:
-    """Time the forces, and check them."""
-    rows = np.linspace(0, system.count - 1, min(_CHECKED, system.count)).astype(int)
-    _, expected = oracle_at(system, rows)
-    seconds = measure(system.apply_forces, device)
-    error = relative(system.forces.numpy()[rows], expected)
+    seconds = measure(system.apply_forces if forces else system.evaluate, device)
+    if forces:
+        error = oracle.relative(system.forces.numpy()[rows], force)
+    else:
+        error = oracle.relative(system.h.numpy()[rows] - system.external_field.numpy()[rows], field)
     return {"seconds": seconds, "pairs_per_second": system.count**2 / seconds, "error": error}
 
 
 def run_induction(system, device) -> dict:
     """Time a cold and a warm solve; the error is the estimate of the solve."""
-
-    def cold():
-        system.start_cold()
-        system.solve()
-
-    seconds = measure(cold, device)
+    seconds = measure(lambda: solve_cold(system), device)
     evaluations = int(system.evaluations.numpy()[0])
     warm = measure(system.solve, device)
     return {
@@ -97,19 +84,19 @@ def make_worlds(worlds: int, count: int, device) -> tuple[MomentSystem, list[wp.
     )  # fmt: skip
     start = np.concatenate([touching_pile(count, seed) for seed in range(worlds)])
     motion = 1e-3 * RADIUS * np.random.default_rng(1).normal(size=start.shape)
-    kind = system.positions.dtype
-    return system, [wp.array(places, dtype=kind, device=device) for places in (start, start + motion)]
+    dtype = system.positions.dtype
+    return system, [wp.array(positions, dtype=dtype, device=device) for positions in (start, start + motion)]
 
 
 def run_worlds(count: int, device) -> dict:
     """Time a magnetic step of many worlds whose balls move by 1e-3 radii, and its parts; check one world."""
     worlds = _WORLDS["cpu" if device.is_cpu else "cuda"]
     began = time.perf_counter()
-    system, places = make_worlds(worlds, count, device)
+    system, states = make_worlds(worlds, count, device)
 
     def there_and_back():
-        for place in places:
-            wp.copy(system.positions, place)
+        for positions in states:
+            wp.copy(system.positions, positions)
             system.solve()
             system.apply_forces()
 
@@ -118,13 +105,8 @@ def run_worlds(count: int, device) -> dict:
     first = time.perf_counter() - began
     seconds = 0.5 * measure(there_and_back, device)
     field, force = measure(system.evaluate, device), measure(system.apply_forces, device)
-    own = slice((worlds - 1) * count, worlds * count)
-    x, m = (a.numpy()[own].astype(float) for a in (system.positions, system.moments))
-    gradients = [
-        oracle.field_gradient(np.delete(x, i, 0), np.delete(m, i, 0), x[i : i + 1], radii=RADIUS, target_radii=RADIUS)
-        for i in range(count)
-    ]
-    expected = np.concatenate([oracle.kelvin_force(m[i : i + 1], gradient) for i, gradient in enumerate(gradients)])
+    last = slice((worlds - 1) * count, worlds * count)
+    _, expected = oracle_at(system.positions.numpy()[last], system.moments.numpy()[last], RADIUS, range(count))
     return {
         "worlds": worlds,
         "seconds": seconds,
@@ -132,13 +114,17 @@ def run_worlds(count: int, device) -> dict:
         "field_seconds": field,
         "force_seconds": force,
         "evaluations": float(system.evaluations.numpy().mean()),
-        "error": relative(system.forces.numpy()[own], expected),
+        "error": oracle.relative(system.forces.numpy()[last], expected),
         "converged": bool(system.converged.numpy().all()),
         "first_call_seconds": first,
     }
 
 
-RUNNERS = {"field": run_field, "force": run_force, "induction": run_induction}
+RUNNERS = {
+    "field": functools.partial(run_sums, forces=False),
+    "force": functools.partial(run_sums, forces=True),
+    "induction": run_induction,
+}
 
 
 def run_system(case: Case, count: int, dtype: str, device) -> dict:
@@ -152,11 +138,6 @@ def run_system(case: Case, count: int, dtype: str, device) -> dict:
     return {**RUNNERS[case.name](system, device), "first_call_seconds": first}
 
 
-def relative(values, expected) -> float:
-    """L2 error of values over the L2 norm of the expected ones."""
-    return float(np.linalg.norm(values - expected) / np.linalg.norm(expected))
-
-
 def run_case(case: Case, device, sizes, frames: int | None, scenes=()) -> None:
     """Print a JSON line for each size and precision of a case, or for each of the bundled scenes."""
     write = line_writer(device)
@@ -164,16 +145,16 @@ def run_case(case: Case, device, sizes, frames: int | None, scenes=()) -> None:
         write({"case": case.name, "scene": name, **run_bundled(name, device)})
     if scenes:
         return
+    whole = {
+        "worlds": run_worlds,
+        "scene": run_scene,
+        "writing": functools.partial(run_writing, frames=frames),
+        "swarm": functools.partial(run_swarm, frames=frames),
+    }
     for dtype in case.dtypes:
         for count in sizes or case.sizes["cpu" if device.is_cpu else "cuda"]:
-            if case.name in RUNNERS:
-                result = run_system(case, count, dtype, device)
-            elif case.name == "writing":
-                result = run_writing(count, device, frames)
-            elif case.name == "swarm":
-                result = run_swarm(count, device, frames)
-            else:
-                result = (run_worlds if case.name == "worlds" else run_scene)(count, device)
+            part = case.name in RUNNERS
+            result = run_system(case, count, dtype, device) if part else whole[case.name](count, device)
             write({"case": case.name, "dtype": dtype, "count": count, **result})
 
 
@@ -184,13 +165,8 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--sizes", type=int, nargs="+")
     parser.add_argument("--frames", type=int, help="frames, for writing and swarm")
-    parser.add_argument(
-        "--scenes",
-        nargs="+",
-        default=(),
-        choices=sorted(bundled()),
-        help="bundled scenes, for the case scene, in place of Balls Up by size",
-    )
+    text = "bundled scenes, for the case scene, in place of Balls Up by size"
+    parser.add_argument("--scenes", nargs="+", default=(), choices=sorted(bundled()), help=text)
     options = parser.parse_args()
     if options.scenes and options.case != "scene":
         parser.error("--scenes is for scene")

@@ -16,10 +16,8 @@ from warpmag import Simulation
 from warpmag.engine.pile_xpbd.capture import without_allocations
 from warpmag.scenes_usd import balls_up, bundled
 
-_SETTLING, _STEPS = 32, 60
-"""Steps before the measurement, in which the balls start to move, and number of measured steps."""
-_AHEAD = 10
-"""Steps that the host may be ahead of the device: beyond about 20 graphs a GPU makes the host wait."""
+_SETTLING, _STEPS = 32, 60  # steps before the measurement, in which the balls start to move, and measured steps
+_AHEAD = 10  # steps that the host may be ahead of the device: beyond about 20 graphs a GPU makes the host wait
 
 
 def run_scene(count: int, device) -> dict:
@@ -98,9 +96,7 @@ def _time_steps(simulation: Simulation, steps: int, device) -> tuple[float, list
 def parts_of_a_substep(simulation: Simulation) -> dict:
     """Measure the parts of a substep of rigid bodies in the present state, each alone.
 
-    Returns:
-        Times [ms] of the broad phase (with contacts of balls), of Newton's narrow phase and of the solver; numbers of
-        contacts and iterations.
+    The times [ms] are those of the broad phase (with contacts of balls), of Newton's narrow phase and of the solver.
     """
     solver, stepper, device = simulation._solver, simulation._stepper, simulation.model.device
     now, then, dt = stepper.state, stepper._other, stepper._longest

@@ -12,3 +12,9 @@ def moment_system(**arguments) -> MomentSystem:
         names = {field.name for field in fields(record)} & arguments.keys()
         arguments[name] = record(**{field: arguments.pop(field) for field in names})
     return MomentSystem(**arguments)
+
+
+def solve_cold(system: MomentSystem) -> None:
+    """Solve without the last solution as the start."""
+    system.start_cold()
+    system.solve()

@@ -5,11 +5,8 @@ import time
 import numpy as np
 import warp as wp
 
-_CHAINED = 10
-"""Repetitions of the work in one captured graph."""
 
-
-def measure(work, device, *, seconds: float = 1.0, repeats: int = 5, chained: int = _CHAINED) -> float:
+def measure(work, device, *, seconds: float = 1.0, repeats: int = 5, chained: int = 10) -> float:
     """Median time [s] of ``work``, a function that only launches kernels.
 
     On a GPU the work is captured ``chained`` times in one graph between two events. This spreads the launch of a graph,

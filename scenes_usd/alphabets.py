@@ -26,15 +26,13 @@ PAINTS = {
 }
 """Linear RGB of the letters, used in turn."""
 
-_GAP = 1.12
-"""Distance of neighboring letters over their largest size along the axis."""
+_GAP = 1.12  # distance of neighboring letters over their largest size along the axis
 _MARGIN = 0.03
 """Collision margin over the thickness of the letters.
 
 The margin keeps the boxes apart, so that a contact has the direction between nearest points, which is continuous. The
 direction in which overlapping boxes are separated may jump to another axis, which ejects letters."""
-_BEVEL = 0.02
-"""Width of the bevel over the size of a capital."""
+_BEVEL = 0.02  # width of the bevel over the size of a capital
 
 
 def author(
@@ -54,7 +52,6 @@ def author(
     """Write the stage to ``path``.
 
     Args:
-        path: USD file to write.
         columns: Letters along x.
         rows: Letters along z.
         layers: Letters along y.
@@ -83,8 +80,8 @@ def author(
     pitch = np.array([_GAP * widths, _GAP * size, _GAP * heights])
     middle = 0.5 * (np.array([columns, layers, rows]) - 1.0)
     UsdGeom.Scope.Define(stage, "/World/Letters")
-    places = itertools.product(range(layers), reversed(range(rows)), range(columns))
-    for number, (layer, row, column) in enumerate(places):
+    cells = itertools.product(range(layers), reversed(range(rows)), range(columns))
+    for number, (layer, row, column) in enumerate(cells):
         letter = used[number % len(used)]
         position = (np.array([column, layer, row]) - middle) * pitch
         body = authoring.add_body(stage, f"/World/Letters/{letter}_{number:03d}", position).GetPrim()
@@ -105,23 +102,16 @@ def _class_of(letter: str) -> Sdf.Path:
 def _define_letter(
     stage: Usd.Stage, letter: str, material: UsdShade.Material, size: float, thickness: float
 ) -> tuple[np.ndarray, float]:
-    """Author the class that all copies of a letter inherit: the visible mesh and the boxes that collide.
-
-    ``material`` is bound to each box, since USD's physics does not inherit material bindings.
-
-    Returns:
-        Width and height [m], and the volume without the bevel [m³].
-    """
+    """Author the class of a letter, its mesh and boxes; return its extent [m], shape [2], and unbeveled volume [m³]."""
     root = stage.CreateClassPrim(_class_of(letter)).GetPath()
     curves = lettering.outline(letter)
-    upright = np.array(
-        [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
-    )  # the letter's y is up, its face looks to -y
+    upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # y of the letter is up, its face at -y
     points, faces = lettering.extruded(curves, thickness / size, _BEVEL)
     shell = UsdGeom.Mesh.Define(stage, root.AppendChild("Shell"))
     author_mesh(shell, size * points @ upright, faces)
     for number, box in enumerate(lettering.boxes(curves)):
         cube = UsdGeom.Cube.Define(stage, root.AppendChild(f"Box_{number:02d}"))
+        prim = cube.GetPrim()
         cube.CreateSizeAttr(1.0)
         cube.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(cube, Usd.TimeCode.Default()))
         cube.CreatePurposeAttr(UsdGeom.Tokens.guide)
@@ -129,30 +119,23 @@ def _define_letter(
         cube.AddRotateYOp().Set(-math.degrees(box.angle))
         sides = 2.0 * size * box.half
         cube.AddScaleOp().Set(Gf.Vec3f(float(sides[0]), thickness, float(sides[1])))
-        UsdPhysics.CollisionAPI.Apply(cube.GetPrim())
-        cube.GetPrim().AddAppliedSchema("NewtonCollisionAPI")
-        margin = cube.GetPrim().CreateAttribute("newton:contactMargin", Sdf.ValueTypeNames.Float, custom=False)
+        UsdPhysics.CollisionAPI.Apply(prim)
+        prim.AddAppliedSchema("NewtonCollisionAPI")
+        margin = prim.CreateAttribute("newton:contactMargin", Sdf.ValueTypeNames.Float, custom=False)
         margin.Set(_MARGIN * thickness)
-        UsdShade.MaterialBindingAPI.Apply(cube.GetPrim()).Bind(material)
+        UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)  # USD's physics does not inherit material bindings
     return size * np.ptp(np.concatenate(curves), axis=0), lettering.area(curves) * size**2 * thickness
 
 
 def _add_center(stage: Usd.Stage, moment: float, core: float) -> None:
     """Author the invisible moment: a static ball that collides with nothing."""
     nothing = authoring.add_material(stage, "Nothing", color=(1.0, 1.0, 1.0))
-    magnetization = moment / (4.0 / 3.0 * math.pi * core**3)
-    center = authoring.add_ball(
-        stage,
-        "/World/Center",
-        (0.0, 0.0, 0.0),
-        core,
-        nothing,
-        motion=authoring.STATIC,
-        magnet=Magnet(kind="permanent", magnetization=(0.0, 0.0, magnetization)),
-    )
+    magnet = Magnet(kind="permanent", magnetization=(0.0, 0.0, moment / (4.0 / 3.0 * math.pi * core**3)))
+    origin = (0.0, 0.0, 0.0)
+    center = authoring.add_ball(stage, "/World/Center", origin, core, nothing, motion=authoring.STATIC, magnet=magnet)
     UsdGeom.Imageable(center).MakeInvisible()
     ghosts = UsdPhysics.CollisionGroup.Define(stage, "/World/Ghosts")
-    ghosts.CreateInvertFilteredGroupsAttr(True)  # collides only with the groups named: none
+    ghosts.CreateInvertFilteredGroupsAttr(True)  # collides only with the groups that it names: none
     ghosts.GetCollidersCollectionAPI().CreateIncludesRel().SetTargets([center.GetPath()])
 
 

@@ -18,14 +18,9 @@ from warpmag.show.materials import author_surface
 from warpmag.usd import author_magnet, author_settings
 from warpmag.usd.write.output import Output
 
-GRAVITY = 9.81
-"""Acceleration of free fall [m/s²]."""
-IRON_DENSITY = 7870.0
-"""Density of iron [kg/m³]."""
-STEEL_COLOR = (0.55, 0.57, 0.6)
-MAGNET_COLOR = (0.75, 0.08, 0.06)
-GROUND_COLOR = (0.32, 0.33, 0.35)
-"""Linear RGB."""
+GRAVITY = 9.81  # acceleration of free fall [m/s²]
+IRON_DENSITY = 7870.0  # density of iron [kg/m³]
+STEEL_COLOR, MAGNET_COLOR, GROUND_COLOR = (0.55, 0.57, 0.6), (0.75, 0.08, 0.06), (0.32, 0.33, 0.35)  # linear RGB
 
 CONTACT_PATCH = 1e-4
 """Size of the contact patch of two bodies [m], the coefficient of rolling and torsional friction.
@@ -38,15 +33,12 @@ BALL_SPACING = 2.002
 DYNAMIC, KINEMATIC, STATIC = "dynamic", "kinematic", "static"
 """Motion of a shape: a body of its own, a body held in place, or a part of its ancestor."""
 
-_FILM, _F_STOP = 0.036, 8.0
-"""Width of the camera's film [m], and focal length over aperture."""
+_FILM, _F_STOP = 0.036, 8.0  # width of the camera's film [m], and focal length over aperture
 _SOFT_BOXES = (
     ("Key", (-0.75, -0.4, 1.0), 0.8, 9.0, (1.0, 0.96, 0.9)),
     ("Rim", (0.9, 0.9, 0.6), 0.6, 8.0, (0.9, 0.95, 1.0)),
 )
 """Name, place and side over the camera's distance, radiance, and linear RGB of each light."""
-
-_METRICS = {"metersPerUnit": 1.0, "kilogramsPerUnit": 1.0, "upAxis": "Z"}
 
 
 def new_stage(documentation: str, *, seconds: float, frames_per_second: float = 60.0) -> Usd.Stage:
@@ -58,9 +50,9 @@ def new_stage(documentation: str, *, seconds: float, frames_per_second: float = 
         frames_per_second: Output rate [Hz], and time codes per second.
     """
     stage = Usd.Stage.CreateInMemory()
-    for key, value in _METRICS.items():
+    metadata = {"metersPerUnit": 1.0, "kilogramsPerUnit": 1.0, "upAxis": "Z", "documentation": documentation}
+    for key, value in metadata.items():
         stage.SetMetadata(key, value)
-    stage.SetMetadata("documentation", documentation)
     stage.SetTimeCodesPerSecond(frames_per_second)
     stage.SetFramesPerSecond(frames_per_second)
     stage.SetStartTimeCode(0.0)
@@ -107,28 +99,25 @@ def add_material(
     coat: float = 0.0,
     density: float | None = None,
     friction: float = 0.0,
-    restitution: float = 0.0,
 ) -> UsdShade.Material:
-    """Author a material for physics and rendering.
+    """Author a material for physics and rendering, ``/World/Materials/NAME``.
 
     Args:
         stage: The stage.
-        name: Name of the prim under ``/World/Materials``.
+        name: Name of the prim.
         color: Linear RGB.
         metallic: Metalness, 0 to 1.
         roughness: Roughness, 0 to 1.
         coat: Weight of a clear coat, 0 to 1.
         density: Mass density [kg/m³] of bodies with this material.
-        friction: Coefficient of static and dynamic friction. If positive, rolling and torsional friction are
-            :data:`CONTACT_PATCH`, otherwise zero.
-        restitution: Coefficient of restitution.
+        friction: Static and dynamic friction. If positive, rolling and torsional friction are :data:`CONTACT_PATCH`.
     """
     UsdGeom.Scope.Define(stage, "/World/Materials")
     material = UsdShade.Material.Define(stage, f"/World/Materials/{name}")
     physics = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
     physics.CreateStaticFrictionAttr(friction)
     physics.CreateDynamicFrictionAttr(friction)
-    physics.CreateRestitutionAttr(restitution)
+    physics.CreateRestitutionAttr(0.0)
     if density is not None:
         physics.CreateDensityAttr(density)
     material.GetPrim().AddAppliedSchema("NewtonMaterialAPI")
@@ -153,26 +142,24 @@ def add_magnet_material(stage: Usd.Stage, *, density: float = 7500.0, friction: 
     )
 
 
-def add_gray_ground(stage: Usd.Stage, *, size: float, friction: float = 0.0) -> Usd.Prim:
-    """Author a ground with its material."""
-    return add_ground(
-        stage, add_material(stage, "Ground", color=GROUND_COLOR, roughness=0.8, friction=friction), size=size
-    )
+def add_gray_ground(stage: Usd.Stage, *, size: float, friction: float = 0.0) -> None:
+    """Author the ground and its material."""
+    add_ground(stage, add_material(stage, "Ground", color=GROUND_COLOR, roughness=0.8, friction=friction), size=size)
 
 
-def add_ground(stage: Usd.Stage, material: UsdShade.Material, *, size: float, color=GROUND_COLOR) -> Usd.Prim:
+def add_ground(stage: Usd.Stage, material: UsdShade.Material, *, size: float) -> None:
     """Author the plane z = 0: infinite as a collider, drawn as a square of ``size`` [m]."""
     plane = UsdGeom.Plane.Define(stage, "/World/Ground")
     plane.CreateAxisAttr(UsdGeom.Tokens.z)
     plane.CreateWidthAttr(size)
     plane.CreateLengthAttr(size)
-    return _finish(plane, material, color, STATIC, None)
+    _add_shape_properties(plane, material, GROUND_COLOR, STATIC)
 
 
 def add_body(stage: Usd.Stage, path: str, position: Sequence[float], *, kinematic: bool = False) -> UsdGeom.Xform:
-    """Author a rigid body at ``position`` [m] whose shapes are to be prims below it."""
+    """Author a rigid body at ``position`` [m]; its shapes are prims below it."""
     body = UsdGeom.Xform.Define(stage, path)
-    _place(body, position)
+    _translate(body, position)
     UsdPhysics.RigidBodyAPI.Apply(body.GetPrim()).CreateKinematicEnabledAttr(kinematic)
     return body
 
@@ -191,8 +178,8 @@ def add_ball(
     """Author a ball: a sphere that is its own collider, centered at ``position`` [m]."""
     ball = UsdGeom.Sphere.Define(stage, path)
     ball.CreateRadiusAttr(radius)
-    _place(ball, position)
-    return _finish(ball, material, color, motion, magnet)
+    _translate(ball, position)
+    return _add_shape_properties(ball, material, color, motion, magnet)
 
 
 def add_ball_prims(stage: Usd.Stage, positions, radius: float, material: UsdShade.Material, *, digits=4, **options):
@@ -209,24 +196,22 @@ def add_balls(
     radius: float,
     material: UsdShade.Material,
     *,
-    magnet: Magnet | None = None,
-    color: Sequence[float] = STEEL_COLOR,
-) -> Usd.Prim:
+    magnet: Magnet,
+) -> None:
     """Author very many balls as instances of one ball, centered at ``positions`` [m], shape [n, 3]."""
     instancer = UsdGeom.PointInstancer.Define(stage, path)
     ball = f"{path}/Ball"
-    add_ball(stage, ball, (0.0, 0.0, 0.0), radius, material, magnet=magnet, color=color)
+    add_ball(stage, ball, (0.0, 0.0, 0.0), radius, material, magnet=magnet)
     instancer.CreatePrototypesRel().SetTargets([Sdf.Path(ball)])
     instancer.CreateProtoIndicesAttr(Vt.IntArray.FromNumpy(np.zeros(len(positions), np.int32)))
     instancer.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(positions, np.float32)))
     bounds = np.array([positions.min(axis=0) - radius, positions.max(axis=0) + radius], np.float32)
     instancer.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(bounds))
-    return instancer.GetPrim()
 
 
-def scatter(places: np.ndarray, spacing: float, apart: float, random: np.random.Generator) -> np.ndarray:
-    """Return places of a cubic lattice, shape [n, 3], with random offsets that keep a distance ``apart`` [m]."""
-    return places + 0.5 * (spacing - apart) * random.uniform(-1.0, 1.0, places.shape)
+def scatter(sites: np.ndarray, spacing: float, least: float, random: np.random.Generator) -> np.ndarray:
+    """Return sites of a cubic lattice, shape [n, 3], with random offsets that keep the ``least`` distance [m]."""
+    return sites + 0.5 * (spacing - least) * random.uniform(-1.0, 1.0, sites.shape)
 
 
 def add_box(
@@ -238,15 +223,14 @@ def add_box(
     *,
     motion: str = DYNAMIC,
     magnet: Magnet | None = None,
-    color: Sequence[float] = MAGNET_COLOR,
 ) -> Usd.Prim:
     """Author a box with edges of ``sizes`` [m] along x, y and z."""
     box = UsdGeom.Cube.Define(stage, path)
     box.CreateSizeAttr(sizes[0])
-    _place(box, position)
+    _translate(box, position)
     if len(set(sizes)) > 1:
         box.AddScaleOp().Set(Gf.Vec3f(*(size / sizes[0] for size in sizes)))
-    return _finish(box, material, color, motion, magnet)
+    return _add_shape_properties(box, material, MAGNET_COLOR, motion, magnet)
 
 
 def add_capsule(
@@ -258,17 +242,17 @@ def add_capsule(
     material: UsdShade.Material,
     *,
     color: Sequence[float],
-) -> Usd.Prim:
+) -> None:
     """Author a static capsule whose axis runs from ``start`` to ``end`` [m]."""
-    along = np.subtract(end, start)
+    axis = np.subtract(end, start)
     capsule = UsdGeom.Capsule.Define(stage, path)
     capsule.CreateAxisAttr(UsdGeom.Tokens.z)
     capsule.CreateRadiusAttr(radius)
-    capsule.CreateHeightAttr(float(np.linalg.norm(along)))
-    _place(capsule, 0.5 * np.add(start, end))
-    turn = Gf.Rotation(Gf.Vec3d(0.0, 0.0, 1.0), Gf.Vec3d(*along.tolist()))
-    capsule.AddOrientOp().Set(Gf.Quatf(turn.GetQuat()))
-    return _finish(capsule, material, color, STATIC, None)
+    capsule.CreateHeightAttr(float(np.linalg.norm(axis)))
+    _translate(capsule, 0.5 * np.add(start, end))
+    rotation = Gf.Rotation(Gf.Vec3d(0.0, 0.0, 1.0), Gf.Vec3d(*axis.tolist()))
+    capsule.AddOrientOp().Set(Gf.Quatf(rotation.GetQuat()))
+    _add_shape_properties(capsule, material, color, STATIC)
 
 
 def add_camera(stage: Usd.Stage, eye: Sequence[float], target: Sequence[float], *, field_of_view: float = 35.0) -> None:
@@ -278,10 +262,10 @@ def add_camera(stage: Usd.Stage, eye: Sequence[float], target: Sequence[float], 
     """
     camera = UsdGeom.Camera.Define(stage, "/World/Camera")
     camera.AddTransformOp().Set(_look_at(eye, target))
-    tenths_per_meter = 10.0 / UsdGeom.GetStageMetersPerUnit(stage)
-    camera.CreateHorizontalApertureAttr(tenths_per_meter * _FILM)
-    camera.CreateVerticalApertureAttr(tenths_per_meter * _FILM * 9.0 / 16.0)
-    camera.CreateFocalLengthAttr(tenths_per_meter * 0.5 * _FILM / math.tan(math.radians(0.5 * field_of_view)))
+    film = 10.0 / UsdGeom.GetStageMetersPerUnit(stage) * _FILM
+    camera.CreateHorizontalApertureAttr(film)
+    camera.CreateVerticalApertureAttr(film * 9.0 / 16.0)
+    camera.CreateFocalLengthAttr(0.5 * film / math.tan(math.radians(0.5 * field_of_view)))
     camera.CreateFStopAttr(_F_STOP)
     distance = math.dist(eye, target)
     camera.CreateClippingRangeAttr(Gf.Vec2f(0.01 * distance, 100.0 * distance))
@@ -290,11 +274,8 @@ def add_camera(stage: Usd.Stage, eye: Sequence[float], target: Sequence[float], 
 
 
 def _add_lights(stage: Usd.Stage, target: Sequence[float], distance: float) -> None:
-    """Author a sky, and two soft boxes at the camera's ``distance`` [m] from ``target`` [m].
-
-    With ``inputs:normalize`` false, intensities are radiances and do not depend on the size of the scene. A white wall
-    that faces the key light has a radiance of about 1 from all lights.
-    """
+    """Author a sky, and two soft boxes at the camera's ``distance`` [m] from ``target`` [m]."""
+    # without normalization intensities are radiances: a white wall that faces the key light has a radiance of about 1
     UsdGeom.Scope.Define(stage, "/World/Lights")
     sky = UsdLux.DomeLight.Define(stage, "/World/Lights/Sky")
     sky.CreateIntensityAttr(0.35)
@@ -321,14 +302,14 @@ def run(author: Callable) -> None:
 
     Types, defaults and help texts of the options are those of its signature and docstring.
     """
-    summary, _, arguments = inspect.getdoc(inspect.getmodule(author)).partition("\n")
-    arguments = dict(re.findall(r"^ {4}(\w+): (.+?)\.?$", inspect.getdoc(author) or "", re.MULTILINE))
+    summary = inspect.getdoc(inspect.getmodule(author)).partition("\n")[0]
+    texts = dict(re.findall(r"^ {4}(\w+): (.+?)\.?$", inspect.getdoc(author) or "", re.MULTILINE))
     parser = argparse.ArgumentParser(description=summary)
-    parser.add_argument("-o", "--output", required=True, help=arguments.pop("path"))
+    parser.add_argument("-o", "--output", required=True, help="USD file to write")
     for name, parameter in inspect.signature(author).parameters.items():
         if name != "path":
             option, kind = f"--{name.replace('_', '-')}", parameter.annotation
-            text = f"{arguments[name]} (default: %(default)s)"
+            text = f"{texts[name]} (default: %(default)s)"
             parser.add_argument(option, type=kind, default=parameter.default, help=text.replace("%)", "%%)"))
     options = vars(parser.parse_args())
     try:
@@ -343,12 +324,12 @@ def check_count(name: str, value: int) -> None:
         raise InputError(f"{name}: must be positive, got {value}")
 
 
-def _place(shape, position) -> None:
+def _translate(shape, position) -> None:
     shape.AddTranslateOp().Set(Gf.Vec3d(*map(float, position)))
 
 
-def _finish(shape, material, color, motion, magnet) -> Usd.Prim:
-    """Make ``shape`` a collider with extent, material, color, motion and, if given, a magnet."""
+def _add_shape_properties(shape, material, color, motion, magnet=None) -> Usd.Prim:
+    """Author collision, extent, material, color, motion and the magnet, if given, of ``shape``; return its prim."""
     prim = shape.GetPrim()
     if motion != STATIC:
         UsdPhysics.RigidBodyAPI.Apply(prim).CreateKinematicEnabledAttr(motion == KINEMATIC)

@@ -28,7 +28,6 @@ def author(
     """Write the stage to ``path``.
 
     Args:
-        path: USD file to write.
         columns: Balls along x.
         rows: Balls along y.
         layers: Balls along z; the lowest layer rests on the ground.
@@ -53,21 +52,15 @@ def author(
     authoring.add_scene(stage, MagneticSettings())
     iron, red = authoring.add_iron_material(stage), authoring.add_magnet_material(stage)
     authoring.add_gray_ground(stage, size=1.0)
-    authoring.add_box(
-        stage,
-        "/World/Magnet",
-        (0.0, 0.0, height),
-        (magnet_size,) * 3,
-        red,
-        magnet=Magnet(kind="permanent", magnetization=(0.0, 0.0, magnetization)),
-        motion=authoring.KINEMATIC,
-    )
+    permanent = Magnet(kind="permanent", magnetization=(0.0, 0.0, magnetization))
+    position, edges = (0.0, 0.0, height), (magnet_size,) * 3
+    authoring.add_box(stage, "/World/Magnet", position, edges, red, magnet=permanent, motion=authoring.KINEMATIC)
     positions = [
         ((x - 0.5 * (columns - 1)) * pitch, (y - 0.5 * (rows - 1)) * pitch, radius + z * pitch)
         for z, y, x in np.ndindex(layers, rows, columns)
     ]
-    magnet = Magnet(saturation=saturation, conductivity=conductivity)
-    authoring.add_ball_prims(stage, positions, radius, iron, magnet=magnet)
+    inducible = Magnet(saturation=saturation, conductivity=conductivity)
+    authoring.add_ball_prims(stage, positions, radius, iron, magnet=inducible)
     authoring.add_camera(stage, (0.28, -0.36, 0.2), (0.0, 0.0, 0.5 * height))
     authoring.save(stage, path)
 

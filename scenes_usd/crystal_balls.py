@@ -33,13 +33,12 @@ def author(
     """Write the stage to ``path``.
 
     Args:
-        path: USD file to write.
-        columns: Places along x.
-        rows: Places along z.
-        bar: Places along x in the middle that the bar magnet occupies.
-        bar_rows: Places along z that the bar magnet occupies.
-        radius: Radius of the balls [m].
-        spacing: Distance of neighboring places [m].
+        columns: Cells of the grid along x.
+        rows: Cells along z.
+        bar: Cells along x in the middle that the bar magnet occupies.
+        bar_rows: Cells along z that the bar magnet occupies.
+        radius: Radius of the balls [m], one in each remaining cell.
+        spacing: Size of a cell [m].
         strong: Magnetization of the strong magnet, along x [A/m].
         weak: Magnetization of the weak magnet, along x [A/m].
         strength: Selected magnet, strong or weak.
@@ -58,9 +57,9 @@ def author(
     sizes = (bar * spacing - gap, bar_rows * spacing - gap, bar_rows * spacing - gap)
     prim = authoring.add_box(stage, "/World/Magnet", (0.0, 0.0, 0.0), sizes, red, motion=authoring.KINEMATIC)
     _add_strengths(prim, {"strong": strong, "weak": weak}, strength)
-    places = [(x - 0.5 * (columns - 1), z - 0.5 * (rows - 1)) for z in range(rows) for x in range(columns)]
-    around = [(x, z) for x, z in places if abs(x) > 0.5 * bar or abs(z) > 0.5 * bar_rows]
-    positions = [(x * spacing, 0.0, z * spacing) for x, z in around]
+    cells = [(x - 0.5 * (columns - 1), z - 0.5 * (rows - 1)) for z in range(rows) for x in range(columns)]
+    occupied = [(x, z) for x, z in cells if abs(x) > 0.5 * bar or abs(z) > 0.5 * bar_rows]
+    positions = [(x * spacing, 0.0, z * spacing) for x, z in occupied]
     options = {"motion": authoring.KINEMATIC, "magnet": Magnet(), "color": CRYSTAL_COLOR}
     authoring.add_ball_prims(stage, positions, radius, crystal, **options)
     reach = spacing * max(columns, 1.78 * rows)
@@ -71,9 +70,9 @@ def author(
 def _check(columns, rows, bar, bar_rows, radius, spacing, strength) -> None:
     for name, value in (("columns", columns), ("rows", rows), ("bar", bar), ("bar_rows", bar_rows)):
         authoring.check_count(name, value)
-    for name, value, whole in (("bar", bar, columns), ("bar_rows", bar_rows, rows)):
-        if value > whole or (whole - value) % 2:
-            raise InputError(f"{name}: must leave as many places on either side of {whole}, got {value}")
+    for name, value, total in (("bar", bar, columns), ("bar_rows", bar_rows, rows)):
+        if value > total or (total - value) % 2:
+            raise InputError(f"{name}: must leave as many places on either side of {total}, got {value}")
     if spacing < authoring.BALL_SPACING * radius:
         raise InputError(f"spacing: balls of radius {radius:g} m would touch, got {spacing:g} m")
     if strength not in ("strong", "weak"):

@@ -29,7 +29,6 @@ def author(
     """Write the stage to ``path``.
 
     Args:
-        path: USD file to write.
         balls: Number of balls.
         layers: Largest number of layers of the stack.
         radius: Radius of the balls [m].
@@ -40,8 +39,8 @@ def author(
         drop: Gap between the magnet and the top of the stack [m].
         friction: Coefficient of friction of all materials.
     """
-    authoring.check_count("balls", balls)
-    authoring.check_count("layers", layers)
+    for name, value in (("balls", balls), ("layers", layers)):
+        authoring.check_count(name, value)
     if not drop > 0.0:
         raise InputError(f"drop: the magnet must be above the stack, got {drop}")
     stage = authoring.new_stage(
@@ -56,15 +55,9 @@ def author(
     positions = stack(balls, layers, radius)
     authoring.add_ball_prims(stage, positions, radius, iron, digits=5, magnet=Magnet(saturation=saturation))
     top = float(positions[:, 2].max()) + radius
-    authoring.add_ball(
-        stage,
-        "/World/Magnet",
-        (0.0, 0.0, top + drop + magnet_radius),
-        magnet_radius,
-        red,
-        magnet=Magnet(kind="permanent", magnetization=(0.0, 0.0, magnetization)),
-        color=authoring.MAGNET_COLOR,
-    )
+    permanent = Magnet(kind="permanent", magnetization=(0.0, 0.0, magnetization))
+    position, color = (0.0, 0.0, top + drop + magnet_radius), authoring.MAGNET_COLOR
+    authoring.add_ball(stage, "/World/Magnet", position, magnet_radius, red, magnet=permanent, color=color)
     reach = max(float(np.ptp(positions[:, 0])), top + drop + 2.0 * magnet_radius)
     authoring.add_camera(stage, (1.2 * reach, -3.2 * reach, 1.2 * reach), (0.0, 0.0, 0.46 * reach))
     authoring.save(stage, path)
@@ -73,7 +66,7 @@ def author(
 def stack(count: int, layers: int, radius: float) -> np.ndarray:
     """Return the positions of balls in a round stack, each above the gap between four balls of the layer below.
 
-    The balls fill the lowest cone with a slope of 45 degrees that holds them, so each ball has the four below it.
+    The balls fill the lowest cone with a slope of 45 degrees that holds them, so that four balls support each ball.
 
     Args:
         count: Number of balls.
@@ -86,17 +79,17 @@ def stack(count: int, layers: int, radius: float) -> np.ndarray:
     pitch = authoring.BALL_SPACING * radius
     rise = pitch / math.sqrt(2.0)
     side = int(2.0 * math.sqrt(count)) + 4  # more than enough for all balls in one layer
-    places = []
+    sites = []
     for layer in range(layers):
         line = (np.arange(side) - 0.5 * (side - 1) + 0.5 * (layer % 2)) * pitch
         x, y = np.meshgrid(line, line)
-        places.append(np.stack([x.ravel(), y.ravel(), np.full(x.size, radius + layer * rise)], axis=1))
-    places = np.concatenate(places)
+        sites.append(np.stack([x.ravel(), y.ravel(), np.full(x.size, radius + layer * rise)], axis=1))
+    sites = np.concatenate(sites)
     # height and angle break ties, so that the choice does not depend on rounding
-    height_of_cone = np.round((np.linalg.norm(places[:, :2], axis=1) + places[:, 2]) / radius, 6)
-    angle = np.round(np.arctan2(places[:, 1], places[:, 0]), 6)
-    chosen = places[np.lexsort((angle, places[:, 2], height_of_cone))[:count]]
-    return chosen[np.lexsort(chosen.T)]
+    height_of_cone = np.round((np.linalg.norm(sites[:, :2], axis=1) + sites[:, 2]) / radius, 6)
+    angle = np.round(np.arctan2(sites[:, 1], sites[:, 0]), 6)
+    positions = sites[np.lexsort((angle, sites[:, 2], height_of_cone))[:count]]
+    return positions[np.lexsort(positions.T)]
 
 
 if __name__ == "__main__":

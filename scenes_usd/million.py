@@ -12,8 +12,7 @@ from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.errors import InputError
 from warpmag.scenes_usd import authoring
 
-_CELLS = 12
-"""Largest number of moments along an edge of the magnet."""
+_CELLS = 12  # largest number of moments along an edge of the magnet
 
 
 def author(
@@ -31,7 +30,6 @@ def author(
     """Write the stage to ``path``.
 
     Args:
-        path: USD file to write.
         balls: Number of balls.
         radius: Radius of the balls [m].
         saturation: Saturation magnetization of the balls [A/m].
@@ -46,9 +44,8 @@ def author(
         raise InputError(f"magnet: must be between 0 and 1, got {magnet:g}")
     if not spacing > 2.2 * radius:
         raise InputError(f"spacing: balls of radius {radius:g} m need more than {2.2 * radius:g} m, got {spacing:g}")
-    size = spacing * np.cbrt(0.75 * balls / math.pi)
-    edge = float(max(magnet * size, 4.0 * radius))
-    places = cloud(balls, radius, spacing, edge, np.random.default_rng(seed))
+    edge = float(max(magnet * (spacing * np.cbrt(0.75 * balls / math.pi)), 4.0 * radius))
+    positions = cloud(balls, radius, spacing, edge, np.random.default_rng(seed))
     stage = authoring.new_stage(
         f"Million: {balls} iron balls without weight are drawn into a clump by a permanent magnet\n\n"
         "No gravity, ordinary friction, steps of 1 ms.",
@@ -58,35 +55,27 @@ def author(
     iron = authoring.add_iron_material(stage, friction=friction)
     red = authoring.add_magnet_material(stage, density=authoring.IRON_DENSITY, friction=friction)
     # cells hardly larger than balls: bodies in contact must be near pairs, which are summed one by one
-    cell = max(edge / _CELLS, 2.0 * radius)
-    authoring.add_box(
-        stage,
-        "/World/Magnet",
-        (0.0, 0.0, 0.0),
-        (edge, edge, edge),
-        red,
-        motion=authoring.KINEMATIC,
-        magnet=Magnet(kind="permanent", magnetization=(0.0, 0.0, magnetization), moment_spacing=cell),
-    )
-    authoring.add_balls(stage, "/World/Balls", places, radius, iron, magnet=Magnet(saturation=saturation))
-    far = float(np.linalg.norm(places, axis=1).max())
-    authoring.add_camera(stage, (1.2 * far, -3.6 * far, 1.2 * far), (0.0, 0.0, 0.0))
+    cell, origin = max(edge / _CELLS, 2.0 * radius), (0.0, 0.0, 0.0)
+    permanent = Magnet(kind="permanent", magnetization=(0.0, 0.0, magnetization), moment_spacing=cell)
+    authoring.add_box(stage, "/World/Magnet", origin, (edge,) * 3, red, motion=authoring.KINEMATIC, magnet=permanent)
+    authoring.add_balls(stage, "/World/Balls", positions, radius, iron, magnet=Magnet(saturation=saturation))
+    reach = float(np.linalg.norm(positions, axis=1).max())
+    authoring.add_camera(stage, (1.2 * reach, -3.6 * reach, 1.2 * reach), origin)
     authoring.save(stage, path)
 
 
 def cloud(count: int, radius: float, spacing: float, edge: float, random: np.random.Generator) -> np.ndarray:
-    """Return the positions of balls around a cube with edges of ``edge`` [m], from the middle outwards.
+    """Return the centers of balls [m], shape [count, 3], around a cube of edge ``edge`` [m], from the middle outwards.
 
-    Returns:
-        Centers [m], shape [count, 3], at least 2.1 radii apart.
+    Distances of the balls are at least 2.1 radii.
     """
     free = 0.5 * edge + radius + 0.5 * spacing
     reach = math.ceil(np.cbrt(0.75 * (count + (2.0 * free / spacing) ** 3) / math.pi)) + 2
     axis = np.arange(-reach, reach + 1) * spacing
-    places = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    places = places[np.abs(places).max(axis=1) >= free]
-    nearest = np.argsort(np.round((places**2).sum(axis=1) / spacing**2, 6), kind="stable")[:count]
-    return authoring.scatter(places[nearest], spacing, 2.1 * radius, random)
+    sites = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    sites = sites[np.abs(sites).max(axis=1) >= free]
+    nearest = np.argsort(np.round((sites**2).sum(axis=1) / spacing**2, 6), kind="stable")[:count]
+    return authoring.scatter(sites[nearest], spacing, 2.1 * radius, random)
 
 
 if __name__ == "__main__":

@@ -22,22 +22,15 @@ BUD_COLOR = (0.9, 0.35, 0.5)
 
 _STEP, _REACHED = 0.032, 0.04
 """Length of a step of growth, and the distance at which a point of the crown is reached, over the tree's height."""
-_UPWARD = 0.15
-"""Upward pull on every twig, over the pull of one point."""
-_APART = 0.068
-"""Smallest distance of the points of the crown over the tree's height."""
-_TWIG = 0.7
-"""Radius of a twig at its end over the radius of its bud."""
-_PIPES = 2.9
-"""Exponent n of the radii at a fork, r^n = Σ r_k^n (da Vinci: 2)."""
-_TAPER = 1.015
-"""Ratio of the radii of a segment and the segment above it."""
-_BALLS_APART = 0.75
-"""Smallest distance of the balls in the sky over their mean spacing; beyond 0.9 random places run out."""
-_USUAL = 2500
-"""Number of balls of a rain as wide as the crown; more balls make the rain wider and higher in proportion."""
-_MANY = 10_000
-"""Larger numbers of balls are authored as instances, at places of a jittered lattice."""
+_UPWARD = 0.15  # upward pull on every twig, over the pull of one point
+_CROWN_DISTANCE = 0.068  # smallest distance of the points of the crown over the tree's height
+_TWIG = 0.7  # radius of a twig at its end over the radius of its bud
+_PIPES = 2.9  # exponent n of the radii at a fork, r^n = Σ r_k^n (da Vinci: 2)
+_TAPER = 1.015  # ratio of the radii of a segment and the segment above it
+_BALL_DISTANCE = 0.75
+"""Smallest distance of the balls in the sky over their mean spacing; beyond 0.9 random positions run out."""
+_USUAL = 2500  # number of balls of a rain as wide as the crown; more balls make the rain wider and higher in proportion
+_MANY = 10_000  # larger numbers of balls are authored as instances, on a jittered lattice
 _CROWN_CENTER, _CROWN = (0.0, 0.0, 0.66), (0.56, 0.56, 0.34)
 """Center and semi-axes of the ellipsoid of the crown, over the tree's height."""
 _TRUNK = ((0.0, 0.0, 0.0), (0.01, -0.006, 0.05), (0.012, -0.014, 0.1), (0.002, -0.018, 0.15), (-0.012, -0.01, 0.2))
@@ -46,17 +39,11 @@ _TRUNK = ((0.0, 0.0, 0.0), (0.01, -0.006, 0.05), (0.012, -0.014, 0.1), (0.002, -
 
 @dataclass(frozen=True)
 class Tree:
-    """A tree of straight segments, each from the node's parent to the node.
+    """A tree of straight segments, each from the node's parent to the node."""
 
-    Attributes:
-        nodes: Positions [m], shape [n, 3].
-        parents: Parent of each node, of smaller index; -1 for the root. Shape [n].
-        radii: Radius of the segment that ends at each node [m], shape [n].
-    """
-
-    nodes: np.ndarray
-    parents: np.ndarray
-    radii: np.ndarray
+    nodes: np.ndarray  # positions [m], shape [n, 3]
+    parents: np.ndarray  # parent of each node, of smaller index, -1 for the root, shape [n]
+    radii: np.ndarray  # radius of the segment that ends at each node [m], shape [n]
 
     @property
     def tips(self) -> np.ndarray:
@@ -81,7 +68,6 @@ def author(
     """Write the stage to ``path``.
 
     Args:
-        path: USD file to write.
         balls: Number of balls.
         branches: Largest number of ends of branches; fewer if the crown has no room.
         radius: Radius of the balls [m].
@@ -93,8 +79,8 @@ def author(
         friction: Coefficient of friction of all materials.
         seed: Seed of the tree and of the rain.
     """
-    authoring.check_count("balls", balls)
-    authoring.check_count("branches", branches)
+    for name, value in (("balls", balls), ("branches", branches)):
+        authoring.check_count(name, value)
     tree = grow(branches, height, bud_radius, np.random.default_rng(seed))
     stage = authoring.new_stage(
         f"Sakura Tree: {balls} iron balls fall from the sky and cling to the magnets at the ends of the branches\n\n"
@@ -107,12 +93,12 @@ def author(
     iron = authoring.add_iron_material(stage, friction=friction)
     authoring.add_gray_ground(stage, size=10.0 * height, friction=friction)
     _add_tree(stage, tree, bark, bud, bud_radius, magnetization)
-    ball_magnet = Magnet(saturation=saturation)
+    inducible = Magnet(saturation=saturation)
     positions = rain(balls, radius, spacing, height, np.random.default_rng(seed))
     if balls > _MANY:
-        authoring.add_balls(stage, "/World/Balls", positions, radius, iron, magnet=ball_magnet)
+        authoring.add_balls(stage, "/World/Balls", positions, radius, iron, magnet=inducible)
     else:
-        authoring.add_ball_prims(stage, positions, radius, iron, digits=5, magnet=ball_magnet)
+        authoring.add_ball_prims(stage, positions, radius, iron, digits=5, magnet=inducible)
     authoring.add_camera(stage, (1.3 * height, -4.6 * height, 1.2 * height), (0.0, 0.0, 0.8 * height))
     authoring.save(stage, path)
 
@@ -121,23 +107,15 @@ def _add_tree(stage, tree, bark, bud, bud_radius, magnetization) -> None:
     """Author the tree as one kinematic body, so that balls that touch any part of it count as held by a magnet."""
     authoring.add_body(stage, "/World/Tree", (0.0, 0.0, 0.0), kinematic=True)
     for node in range(1, len(tree.nodes)):
+        path, radius = f"/World/Tree/Branch_{node:04d}", float(tree.radii[node])
         start, end = tree.nodes[tree.parents[node]], tree.nodes[node]
-        authoring.add_capsule(
-            stage, f"/World/Tree/Branch_{node:04d}", start, end, float(tree.radii[node]), bark, color=BARK_COLOR
-        )
+        authoring.add_capsule(stage, path, start, end, radius, bark, color=BARK_COLOR)
     for number, tip in enumerate(tree.tips):
-        along = tree.nodes[tip] - tree.nodes[tree.parents[tip]]
-        along *= magnetization / np.linalg.norm(along)
-        authoring.add_ball(
-            stage,
-            f"/World/Tree/Bud_{number:04d}",
-            tree.nodes[tip],
-            bud_radius,
-            bud,
-            motion=authoring.STATIC,
-            magnet=Magnet(kind="permanent", magnetization=tuple(along.tolist())),
-            color=BUD_COLOR,
-        )
+        direction = tree.nodes[tip] - tree.nodes[tree.parents[tip]]
+        direction *= magnetization / np.linalg.norm(direction)
+        magnet = Magnet(kind="permanent", magnetization=tuple(direction.tolist()))
+        options = {"motion": authoring.STATIC, "magnet": magnet, "color": BUD_COLOR}
+        authoring.add_ball(stage, f"/World/Tree/Bud_{number:04d}", tree.nodes[tip], bud_radius, bud, **options)
 
 
 def grow(branches: int, height: float, bud_radius: float, random: np.random.Generator) -> Tree:
@@ -151,15 +129,14 @@ def grow(branches: int, height: float, bud_radius: float, random: np.random.Gene
     """
     if not 0.0 < bud_radius < 0.5 * _STEP * height:
         raise InputError(f"bud_radius: must be positive and below {0.5 * _STEP * height:g} m, got {bud_radius:g}")
-    goals = _crown(branches, random)
+    targets = _crown(branches, random)
     nodes, parents = [np.array(node) for node in _TRUNK], list(range(-1, len(_TRUNK) - 1))
-    while len(goals):
-        distances = np.linalg.norm(goals[:, None] - nodes[len(_TRUNK) - 1 :], axis=2)
-        nearest = distances.argmin(axis=1)
-        grown = len(nodes)
-        for place in np.unique(nearest):
-            node = place + len(_TRUNK) - 1
-            pulls = goals[nearest == place] - nodes[node]
+    fork = len(_TRUNK) - 1
+    while len(targets):
+        nearest = fork + np.linalg.norm(targets[:, None] - nodes[fork:], axis=2).argmin(axis=1)
+        count = len(nodes)
+        for node in np.unique(nearest):
+            pulls = targets[nearest == node] - nodes[node]
             direction = (pulls / np.linalg.norm(pulls, axis=1, keepdims=True)).sum(axis=0)
             direction[2] += _UPWARD
             # rounded, so that the same tree grows on every machine
@@ -167,38 +144,38 @@ def grow(branches: int, height: float, bud_radius: float, random: np.random.Gene
             if np.linalg.norm(np.array(nodes) - new, axis=1).min() > 0.6 * _STEP:
                 nodes.append(new)
                 parents.append(int(node))
-        if len(nodes) == grown:
+        if len(nodes) == count:
             break  # points that pull a twig to and fro remain unreached
-        near = np.linalg.norm(goals[:, None] - nodes[grown:], axis=2).min(axis=1)
-        goals = goals[near > _REACHED]
+        distances = np.linalg.norm(targets[:, None] - nodes[count:], axis=2).min(axis=1)
+        targets = targets[distances > _REACHED]
     nodes, parents = np.array(nodes), np.array(parents)
     nodes, parents = _without_close_tips(nodes, parents, 2.5 * bud_radius / height)
     return Tree(height * nodes, parents, _radii(parents, _TWIG * bud_radius))
 
 
 def _crown(count: int, random: np.random.Generator) -> np.ndarray:
-    """Return points in the upper part of the crown's ellipsoid, at least ``_APART`` apart, shape [n, 3]."""
+    """Return points in the upper part of the crown's ellipsoid, shape [n, 3]."""
     points = np.empty((0, 3))
     for _ in range(200 * count):
         point = random.uniform(-1.0, 1.0, 3)
         if np.linalg.norm(point) > 1.0 or point[2] < -0.55 + 0.3 * np.hypot(*point[:2]):
             continue
         point = np.array(_CROWN_CENTER) + np.array(_CROWN) * point
-        if not len(points) or np.linalg.norm(points - point, axis=1).min() > _APART:
+        if not len(points) or np.linalg.norm(points - point, axis=1).min() > _CROWN_DISTANCE:
             points = np.vstack([points, point])
         if len(points) == count:
             break
     return points
 
 
-def _without_close_tips(nodes, parents, apart) -> tuple[np.ndarray, np.ndarray]:
-    """Remove twigs whose ends are closer than ``apart`` to another node, each down to its fork."""
+def _without_close_tips(nodes, parents, least) -> tuple[np.ndarray, np.ndarray]:
+    """Remove twigs whose ends are nearer to another node than the distance ``least``, each down to its fork."""
     while True:
         forks = np.bincount(parents[1:], minlength=len(nodes))
         tips = np.flatnonzero(forks == 0)
         for tip in tips:
-            others = np.delete(np.arange(len(nodes)), [tip, parents[tip]])
-            if np.linalg.norm(nodes[others] - nodes[tip], axis=1).min() < apart:
+            rest = np.delete(nodes, [tip, parents[tip]], axis=0)
+            if np.linalg.norm(rest - nodes[tip], axis=1).min() < least:
                 break
         else:
             return nodes, parents
@@ -223,7 +200,7 @@ def _radii(parents, twig) -> np.ndarray:
 
 
 def rain(count: int, radius: float, spacing: float, height: float, random: np.random.Generator) -> np.ndarray:
-    """Return random positions of balls above the tree, at least ``_BALLS_APART * spacing`` apart.
+    """Return random positions of balls above the tree.
 
     Args:
         count: Number of balls.
@@ -235,26 +212,26 @@ def rain(count: int, radius: float, spacing: float, height: float, random: np.ra
     Returns:
         Centers [m], shape [count, 3], from the lowest up.
     """
-    apart = _BALLS_APART * spacing
-    if apart < authoring.BALL_SPACING * radius:
-        least = authoring.BALL_SPACING * radius / _BALLS_APART
-        raise InputError(f"spacing: balls of radius {radius:g} m need at least {least:g} m, got {spacing:g} m")
+    least = _BALL_DISTANCE * spacing
+    if least < authoring.BALL_SPACING * radius:
+        needed = authoring.BALL_SPACING * radius / _BALL_DISTANCE
+        raise InputError(f"spacing: balls of radius {radius:g} m need at least {needed:g} m, got {spacing:g} m")
     reach = max(_CROWN[0] * height, spacing) * max(1.0, count / _USUAL) ** (1.0 / 3.0)
     bottom = (_CROWN_CENTER[2] + _CROWN[2] + 0.15) * height
     depth = count * spacing**3 / (math.pi * reach**2)
     if count > _MANY:
         return _lattice_rain(count, reach, spacing, random) + np.array([0.0, 0.0, bottom])
-    places: list[list[float]] = []
+    positions: list[list[float]] = []
     cells: dict[tuple[int, ...], list[list[float]]] = {}
     around = list(itertools.product((-1, 0, 1), repeat=3))
-    while len(places) < count:
-        place = np.round(random.uniform((-reach, -reach, bottom), (reach, reach, bottom + depth)), 6).tolist()
-        x, y, z = (int(coordinate // apart) for coordinate in place)
-        near = [ball for a, b, c in around for ball in cells.get((x + a, y + b, z + c), ())]
-        if math.hypot(*place[:2]) <= reach and all(math.dist(ball, place) > apart for ball in near):
-            places.append(place)
-            cells.setdefault((x, y, z), []).append(place)
-    return np.array(sorted(places, key=lambda place: place[2]))
+    while len(positions) < count:
+        position = np.round(random.uniform((-reach, -reach, bottom), (reach, reach, bottom + depth)), 6).tolist()
+        x, y, z = (int(coordinate // least) for coordinate in position)
+        neighbors = [ball for a, b, c in around for ball in cells.get((x + a, y + b, z + c), ())]
+        if math.hypot(*position[:2]) <= reach and all(math.dist(ball, position) > least for ball in neighbors):
+            positions.append(position)
+            cells.setdefault((x, y, z), []).append(position)
+    return np.array(sorted(positions, key=lambda position: position[2]))
 
 
 def _lattice_rain(count: int, reach: float, spacing: float, random: np.random.Generator) -> np.ndarray:
@@ -265,8 +242,8 @@ def _lattice_rain(count: int, reach: float, spacing: float, random: np.random.Ge
     disc = disc[np.hypot(*disc.T) <= reach]
     layers = math.ceil(count / len(disc))
     heights = np.repeat((np.arange(layers) + 0.5) * spacing, len(disc))
-    places = np.column_stack([np.tile(disc, (layers, 1)), heights])[:count]
-    return authoring.scatter(places, spacing, _BALLS_APART * spacing, random)
+    sites = np.column_stack([np.tile(disc, (layers, 1)), heights])[:count]
+    return authoring.scatter(sites, spacing, _BALL_DISTANCE * spacing, random)
 
 
 if __name__ == "__main__":

@@ -19,14 +19,11 @@ from warpmag.moments.dynamics import SubmagnetizationPairs
 from warpmag.moments.system import MomentSystem
 from warpmag.shapes import lattice
 
-BALL_RADIUS = 0.005
-"""Radius of the balls [m]."""
-PITCH = 0.011
-"""Distance of neighbors [m]; the balls do not touch."""
+BALL_RADIUS = 0.005  # radius of the balls [m]
+PITCH = 0.011  # distance of neighbors [m]; the balls do not touch
 CELLS, OTHER_CELLS = (16, 13, 10, 3), (14, 13, 4, 1)
 """Cells of the grid along x and y, and cells of the bar; the first and the second choice."""
-STRENGTHS = {"weak": 1e6, "strong": 4e7}
-"""Magnetization of the bar, along its length [A/m]."""
+STRENGTHS = {"weak": 1e6, "strong": 4e7}  # magnetization of the bar, along its length [A/m]
 PAIRS = ("across", "in plane", "random")
 """Initial directions M1 = −M2 of the pairs: normal to the plane of the balls; in the plane, across the bar; random."""
 
@@ -43,59 +40,44 @@ class Layout:
 def layout(cells: tuple[int, int, int, int] = CELLS) -> Layout:
     """Return the positions of balls and bar."""
     columns, rows, length, width = cells
-    places = [(i - 0.5 * (columns - 1), j - 0.5 * (rows - 1), 0.0) for j in range(rows) for i in range(columns)]
-    balls = [(x, y, z) for x, y, z in places if abs(x) > 0.5 * length or abs(y) > 0.5 * width]
+    centers = [(i - 0.5 * (columns - 1), j - 0.5 * (rows - 1), 0.0) for j in range(rows) for i in range(columns)]
+    balls = [(x, y, z) for x, y, z in centers if abs(x) > 0.5 * length or abs(y) > 0.5 * width]
     half = (0.5 * length * PITCH - 5e-4, 0.5 * width * PITCH - 5e-4, 0.5 * width * PITCH - 5e-4)
     return Layout(PITCH * np.array(balls), half, lattice.fill([lattice.box(half)], 0.5 * PITCH))
 
 
-def make_system(strength: float, dynamics: str, device: str, *, cells=CELLS, **settings) -> MomentSystem:
-    """Return a system of the balls, followed by the bar's moments.
+def make_system(strength, dynamics: str, device: str, *, cells=CELLS, start="across", **settings) -> MomentSystem:
+    """Return a system of the balls, followed by the moments of a bar of magnetization ``strength`` [A/m].
 
-    Args:
-        strength: Magnetization of the bar [A/m].
-        dynamics: One of ``warpmag.declarations.magnets.DYNAMICS``.
-        device: Warp device.
-        cells: Cells of the grid and of the bar.
-        settings: More arguments of :class:`MomentSystem`.
+    Pairs have the directions ``start``, one of :data:`PAIRS`; ``settings`` are more arguments of ``moment_system``.
     """
-    place = layout(cells)
-    balls, bar = place.balls, place.bar
+    balls, bar = layout(cells).balls, layout(cells).bar
     count = len(balls) + len(bar.positions)
     system = moment_system(
-        radii=np.concatenate([np.full(len(balls), BALL_RADIUS), bar.radii]),
-        permanent=np.arange(count) >= len(balls),
-        saturation=SATURATION_OF_IRON,
-        dynamics=dynamics,
-        device=device,
-        **settings,
-    )
+        radii=np.concatenate([np.full(len(balls), BALL_RADIUS), bar.radii]), permanent=np.arange(count) >= len(balls),
+        saturation=SATURATION_OF_IRON, dynamics=dynamics, device=device, **settings,
+    )  # fmt: skip
     system.positions.assign(np.concatenate([balls, bar.positions]))
     moments = np.zeros((count, 3))
     moments[len(balls) :, 0] = strength * bar.volumes
     system.moments.assign(moments)
+    if dynamics != "theta":
+        set_pairs(system, start)
     return system
 
 
 def applied_field(strength: float) -> np.ndarray:
     """Return the field at the balls [A/m] of a bar of magnetization ``strength`` [A/m], shape [178, 3]."""
-    place = layout()
-    moments = np.outer(place.bar.volumes, [strength, 0.0, 0.0])
-    return warpmag.h_field(
-        place.bar.positions,
-        moments,
-        place.balls,
-        radii=place.bar.radii,
-        target_radii=BALL_RADIUS,
-        dtype="float64",
-        device="cpu",
-    )
+    balls, bar = layout().balls, layout().bar
+    moments = np.outer(bar.volumes, [strength, 0.0, 0.0])
+    settings = {"radii": bar.radii, "target_radii": BALL_RADIUS, "dtype": "float64", "device": "cpu"}
+    return warpmag.h_field(bar.positions, moments, balls, **settings)
 
 
-def set_pairs(system: MomentSystem, start: str, seed: int = 0):
+def set_pairs(system: MomentSystem, start: str):
     """Set the pairs of a system to one of the directions :data:`PAIRS`."""
     if start == "random":
-        axis = np.random.default_rng(seed).normal(size=(system.count, 3))
+        axis = np.random.default_rng(0).normal(size=(system.count, 3))
     else:
         axis = np.tile([0.0, 0.0, 1.0] if start == "across" else [0.0, 1.0, 0.0], (system.count, 1))
     axis /= np.linalg.norm(axis, axis=1)[:, None]

@@ -19,10 +19,8 @@ from warpmag.declarations.magnets import SATURATION_OF_IRON
 from warpmag.moments.system import MomentSystem
 from warpmag.shapes import lattice
 
-RADIUS = 0.02
-"""Radius of the sphere [m]."""
-BALL_RADIUS = 0.0005
-"""Radius of the small ball outside [m]."""
+RADIUS = 0.02  # radius of the sphere [m]
+BALL_RADIUS = 0.0005  # radius of the small ball outside [m]
 LAWS = {"kelvin": "(a) Kim et al. 2018 (Kelvin, Eq. 13)", "zeeman": "(b) the paper (Zeeman, Eq. 4)"}
 LEVELS = {"weak": 0.1, "strong": 0.99}
 """Magnetization of the sphere over Ms: weak, and close to saturation."""

@@ -27,7 +27,8 @@ def run(output: Output):
             _draw(axis, pairs, f"{author} ({dynamics}), {name} bar\n$e_M$ = {error:.1e} after {evaluations} iterations")
             output.record(strength=name, dynamics=dynamics, curve=curve, error=error, iterations=evaluations)
             rows.append([name, author, f"`{dynamics}`", evaluations, f"{error:.1e}"])
-        _draw(row[0], _before(output.device), f"before, {name} bar")
+        start = crystal_balls.directions(crystal_balls.make_system(0.0, "llg", output.device))
+        _draw(row[0], start, f"before, {name} bar")
     figure.tight_layout()
     output.report(
         f"""## Fig. 7: crystal balls
@@ -45,17 +46,9 @@ strengths. Where the two coincide, the ball is saturated.
     plt.close(figure)
 
 
-def _before(device: str):
-    system = crystal_balls.make_system(0.0, "llg", device)
-    crystal_balls.set_pairs(system, "across")
-    return crystal_balls.directions(system)
-
-
 def _settle(dynamics: str, curve: str, strength: float, device: str):
     """Return the pair of each ball after induction, the error and the iterations."""
     system = crystal_balls.make_system(strength, dynamics, device, curve=curve, max_evaluations=ITERATIONS)
-    if dynamics != "theta":
-        crystal_balls.set_pairs(system, "across")
     errors = trace(system, to_residual=True)
     if dynamics == "theta":
         pairs = _symmetric_pair(system.magnetizations().numpy() / SATURATION_OF_IRON)
@@ -72,21 +65,17 @@ def _symmetric_pair(reduced: np.ndarray):
 
 
 def _draw(axis, pairs, title: str):
-    place = crystal_balls.layout()
-    balls = place.balls
-    count = len(balls)
-    at = 1e3 * balls @ _TILT.T
-    length = 1.1e3 * crystal_balls.BALL_RADIUS
-    a, b, _ = 1e3 * np.array(place.bar_half_extents)
-    axis.add_patch(Rectangle((-a, -b), a, 2 * b, color="0.35"))
-    axis.add_patch(Rectangle((0.0, -b), a, 2 * b, color="0.6"))
-    axis.text(0.5 * a, 0.0, "N", ha="center", va="center", color="w", fontsize=16)
-    axis.text(-0.5 * a, 0.0, "S", ha="center", va="center", color="w", fontsize=16)
-    for ball in at:
-        axis.add_patch(Circle(ball, 1e3 * crystal_balls.BALL_RADIUS, fc="#dbe9f4", ec="0.7", lw=0.5))
+    layout = crystal_balls.layout()
+    centers, radius = 1e3 * layout.balls @ _TILT.T, 1e3 * crystal_balls.BALL_RADIUS  # mm
+    a, b, _ = 1e3 * np.array(layout.bar_half_extents)
+    for left, pole, color in ((-a, "S", "0.35"), (0.0, "N", "0.6")):
+        axis.add_patch(Rectangle((left, -b), a, 2 * b, color=color))
+        axis.text(left + 0.5 * a, 0.0, pole, ha="center", va="center", color="w", fontsize=16)
+    for center in centers:
+        axis.add_patch(Circle(center, radius, fc="#dbe9f4", ec="0.7", lw=0.5))
     for directions, color in zip(pairs, ("#d62728", "#1f4fd8"), strict=True):
-        arrow = length * directions[:count] @ _TILT.T
-        axis.quiver(*at.T, *arrow.T, color=color, angles="xy", scale_units="xy", scale=1.0, width=0.0028)
+        arrow = 1.1 * radius * directions[: len(centers)] @ _TILT.T
+        axis.quiver(*centers.T, *arrow.T, color=color, angles="xy", scale_units="xy", scale=1.0, width=0.0028)
     axis.set_title(title, fontsize=10)
     axis.set_aspect("equal")
     axis.set_axis_off()

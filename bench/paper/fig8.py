@@ -19,8 +19,7 @@ COLORS = {"weak": "tab:green", "strong": "tab:red"}
 STEPS = (0.01, 0.03, 0.1, STEP, 1.0, 2.0)
 BARS = (1e6, 1e7, 4e7, 1e8)
 """Second choices: steps κ, and magnetizations of the bar [A/m]."""
-PATIENCE = 5000
-"""Largest number of iterations of a second choice."""
+PATIENCE = 5000  # largest number of iterations of a second choice
 
 
 def run(output: Output):
@@ -41,33 +40,24 @@ def run(output: Output):
         axis.legend(fontsize=8)
     axes[0].set_ylabel("$e_M$ (Eq. 12)")
     figure.tight_layout()
-    others = "" if output.small else _second_choices(output)
-    output.report(_text(output.save(figure), histories, others))
+    second = "" if output.small else _second_choices(output)
+    output.report(_text(output.save(figure), histories, second))
     plt.close(figure)
 
 
-def _make_system(dynamics, curve, bar, device, iterations, *, step=STEP, start="across", **layout):
+def _trace(dynamics, curve, bar, device, iterations, *, step=STEP, **settings) -> np.ndarray:
+    """Return the error after each iteration."""
     explicit = {"step": step} if dynamics != "theta" else {}
-    system = crystal_balls.make_system(
-        bar, dynamics, device, curve=curve, rtol=TOLERANCE, max_evaluations=iterations, **explicit, **layout
-    )
-    if explicit:
-        crystal_balls.set_pairs(system, start)
-    return system
+    settings |= {"curve": curve, "rtol": TOLERANCE, "max_evaluations": iterations}
+    return trace(crystal_balls.make_system(bar, dynamics, device, **explicit, **settings), to_residual=True)
 
 
 def _errors(dynamics, curve, strength, output):
     """Return and record the error after each iteration."""
-    system = _make_system(dynamics, curve, crystal_balls.STRENGTHS[strength], output.device, ITERATIONS)
-    errors = trace(system, to_residual=True)
-    output.record(
-        strength=strength,
-        dynamics=dynamics,
-        curve=curve,
-        converged=bool(errors[-1] <= TOLERANCE),
-        iterations=len(errors),
-        errors=[float(f"{e:.4g}") for e in errors],
-    )
+    errors = _trace(dynamics, curve, crystal_balls.STRENGTHS[strength], output.device, ITERATIONS)
+    result = {"converged": bool(errors[-1] <= TOLERANCE), "iterations": len(errors)}
+    rounded = [float(f"{e:.4g}") for e in errors]
+    output.record(strength=strength, dynamics=dynamics, curve=curve, **result, errors=rounded)
     return errors
 
 
@@ -81,8 +71,7 @@ def _second_choices(output: Output) -> str:
     explicit = [method for method in methods if method[0] != "theta"]
 
     def outcome(dynamics, curve, choice):
-        system = _make_system(dynamics, curve, device=output.device, iterations=PATIENCE, **choice)
-        errors = trace(system, to_residual=True)
+        errors = _trace(dynamics, curve, device=output.device, iterations=PATIENCE, **choice)
         iterations, error = len(errors), float(errors[-1])
         output.record(dynamics=dynamics, curve=curve, **choice, iterations=iterations, error=error)
         return _outcome(iterations, error)
@@ -123,10 +112,8 @@ submagnetization moves only perpendicular to itself, so M along the pair's axis 
 {table(["dynamics", "bar", *crystal_balls.PAIRS], starts)}"""
 
 
-def _text(image, histories, others) -> str:
-    rows = [
-        [f"`{dynamics}`", name, _outcome(len(errors), errors[-1])] for (dynamics, name), errors in histories.items()
-    ]
+def _text(image, histories, second) -> str:
+    rows = [[f"`{dynamics}`", bar, _outcome(len(errors), errors[-1])] for (dynamics, bar), errors in histories.items()]
     return f"""## Fig. 8: magnetization error over iterations
 
 **Paper:** (a) Kim et al. 2018 do not converge under the strong bar and slowly under the weak one; (b) the paper's
@@ -140,4 +127,4 @@ across the plane of the balls. `theta` is this library's method, accelerated; it
 
 {table(["dynamics", "bar", f"iterations to e_M ≤ {TOLERANCE:g}, or (error left after {ITERATIONS})"], rows)}
 
-{others}"""
+{second}"""

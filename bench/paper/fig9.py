@@ -29,29 +29,19 @@ from warpmag.moments.dynamics import STEP
 MOST_ITERATIONS = 999
 SLOPE = 3.0
 """Initial slope k of the curve, and step κ0 of the flow."""
-ROWS_AT_ONCE = 40
-"""Field strengths of one batch, which bounds the memory."""
+ROWS_AT_ONCE = 40  # field strengths of one batch, which bounds the memory
 
 
 @dataclass(frozen=True)
 class Case:
-    """One sweep: a dynamics with its curve and constants.
-
-    Attributes:
-        dynamics: Name of the dynamics.
-        curve: Magnetization curve, ``tanh`` or ``clamped``.
-        kappa: Step κ0 [dimensionless].
-        opening: Angle between M1 and M2 at the start [degrees].
-        tolerance: Magnetization error (Eq. 12) at which a test ends.
-        damping: Damping α of LLG.
-    """
+    """One sweep: a dynamics with its curve and constants."""
 
     dynamics: str
-    curve: str
-    kappa: float
-    opening: float = 180.0
-    tolerance: float = 1e-3
-    damping: float = 0.2
+    curve: str  # magnetization curve, ``tanh`` or ``clamped``
+    kappa: float  # step κ0
+    opening: float = 180.0  # angle between M1 and M2 at the start [degrees]
+    tolerance: float = 1e-3  # magnetization error (Eq. 12) at which a test ends
+    damping: float = 0.2  # damping α of LLG
 
 
 PANELS = {
@@ -98,6 +88,16 @@ class Counts:
     most: np.ndarray
     failed: np.ndarray
 
+    def summary(self) -> dict:
+        """Statistics of all cells."""
+        return {
+            "mean_iterations": float(self.mean.mean()),
+            "most_iterations": int(self.most.max()),
+            "failed_tests": float(self.failed.mean()),
+            "cells_with_failures": float((self.failed > 0).mean()),
+            "cells_failed": float((self.failed == 1).mean()),
+        }
+
 
 def sweep(case: Case, grid: Grid) -> Counts:
     """Run one sweep."""
@@ -129,7 +129,7 @@ def iterations(case: Case, h: np.ndarray, kappa: np.ndarray) -> np.ndarray:
     flow = case.dynamics in ("theta", "theta-flow")
     start = _inverse_curve(0.5 * (pair[0] + pair[1]), case.curve)
     state = [start, start, np.zeros_like(start)] if flow else pair
-    goal = _curve(SLOPE * h, case.curve)
+    solution = _curve(SLOPE * h, case.curve)
     counts, running = np.full(len(h), MOST_ITERATIONS + 1), np.arange(len(h))
     for count in range(1, MOST_ITERATIONS + 1):
         if flow:
@@ -138,11 +138,11 @@ def iterations(case: Case, h: np.ndarray, kappa: np.ndarray) -> np.ndarray:
         else:
             state = _pair_step(*state, h, kappa, case)
             m = 0.5 * (state[0] + state[1])
-        size = _size(goal)
-        ended = (_size(m - goal) <= case.tolerance * np.where(size > 0.0, size, 1.0))[:, 0]
+        size = _size(solution)
+        ended = (_size(m - solution) <= case.tolerance * np.where(size > 0.0, size, 1.0))[:, 0]
         counts[running[ended]] = count
-        going = ~ended & np.isfinite(m).all(axis=1)
-        running, h, kappa, goal, *state = (array[going] for array in (running, h, kappa, goal, *state))
+        rest = ~ended & np.isfinite(m).all(axis=1)
+        running, h, kappa, solution, *state = (array[rest] for array in (running, h, kappa, solution, *state))
         if not len(running):
             break
     return counts
@@ -167,8 +167,8 @@ def _pair_step(u, v, h, kappa, case: Case) -> list[np.ndarray]:
         return [_theta_step(u, h_eff, kappa, 1.0), _theta_step(v, h_eff, kappa, -1.0)]
     precession = 0.0 if "damping" in case.dynamics else 1.0 / case.damping
     unit = not case.dynamics.endswith("unscaled")
-    turned = [np.cross(w, h_eff) for w in (u, v)]
-    new = [w - kappa * (np.cross(w, t) + precession * t) for w, t in zip((u, v), turned, strict=True)]
+    torques = [np.cross(w, h_eff) for w in (u, v)]
+    new = [w - kappa * (np.cross(w, t) + precession * t) for w, t in zip((u, v), torques, strict=True)]
     return [w / _size(w) for w in new] if unit else new
 
 
@@ -177,14 +177,14 @@ def _theta_step(u, h_eff, kappa, side: float) -> np.ndarray:
     strength = _size(h_eff)
     axis = h_eff / np.where(strength > 0.0, strength, 1.0)
     cosine = (u * axis).sum(axis=1, keepdims=True)
-    off = u - cosine * axis
-    sine = _size(off)
+    perpendicular = u - cosine * axis
+    sine = _size(perpendicular)
     farthest = np.eye(3)[2 - np.abs(axis)[:, ::-1].argmin(axis=1)]  # coordinate axis, z before y before x
-    across = farthest - (farthest * axis).sum(axis=1, keepdims=True) * axis
-    plane = np.where(sine > 1e-6, off / np.where(sine > 1e-6, sine, 1.0), side * across / _size(across))
+    default = farthest - (farthest * axis).sum(axis=1, keepdims=True) * axis
+    normal = np.where(sine > 1e-6, perpendicular / np.where(sine > 1e-6, sine, 1.0), side * default / _size(default))
     rate = np.where(cosine > 0.0, sine, 2.0 - sine)
     theta = np.maximum(np.arctan2(sine, cosine) - kappa * strength * rate, 0.0)
-    return np.where(strength > 0.0, np.cos(theta) * axis + np.sin(theta) * plane, u)
+    return np.where(strength > 0.0, np.cos(theta) * axis + np.sin(theta) * normal, u)
 
 
 def _curve(s, curve: str) -> np.ndarray:
@@ -196,17 +196,14 @@ def _curve(s, curve: str) -> np.ndarray:
 
 def _inverse_curve(m, curve: str) -> np.ndarray:
     """k H/Ms of magnetizations over Ms, bounded near saturation."""
+    if curve == "clamped":
+        return m
     size = np.minimum(_size(m), 0.999999)
-    return (
-        m if curve == "clamped" else np.where(size > 0.0, np.arctanh(size) / np.where(size > 0.0, size, 1.0), 1.0) * m
-    )
+    return np.where(size > 0.0, np.arctanh(size) / np.where(size > 0.0, size, 1.0), 1.0) * m
 
 
 def _size(vectors) -> np.ndarray:
     return np.linalg.norm(vectors, axis=-1, keepdims=True)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
 
 
 def run(output: Output):
@@ -224,47 +221,38 @@ def run(output: Output):
         rows.append([f"`{case.dynamics}`", f"{case.kappa:g}", *_cells(counts)])
     axes[0].set_ylabel("‖H‖ / Ms")
     figure.colorbar(image, ax=axes, label="mean iterations (violet 1, red 999 or failed)")
-    others = [
+    second = [
         [f"`{case.dynamics}`", name, *_cells(_measure(case, coarse, output))]
         for name, case in (() if output.small else SECOND_CHOICES)
     ]
-    output.report(_text(output.save(figure), grid, rows, others))
+    output.report(_text(output.save(figure), grid, rows, second))
     plt.close(figure)
 
 
 def _measure(case: Case, grid: Grid, output: Output) -> Counts:
     began = time.perf_counter()
     counts = sweep(case, grid)
-    output.record(
-        **vars(case),
-        cells=counts.mean.size,
-        directions=grid.directions,
-        mean_iterations=float(counts.mean.mean()),
-        most_iterations=int(counts.most.max()),
-        failed_tests=float(counts.failed.mean()),
-        cells_with_failures=float((counts.failed > 0).mean()),
-        cells_failed=float((counts.failed == 1).mean()),
-        seconds=round(time.perf_counter() - began, 2),
-    )
+    size, seconds = {"cells": counts.mean.size, "directions": grid.directions}, round(time.perf_counter() - began, 2)
+    output.record(**vars(case), **size, **counts.summary(), seconds=seconds)
     return counts
 
 
 def _cells(counts: Counts) -> list[str]:
-    shares = (counts.failed.mean(), (counts.failed > 0).mean(), (counts.failed == 1).mean())
-    return [f"{counts.mean.mean():.2f}", f"{counts.most.max()}", *(f"{100 * share:.2f} %" for share in shares)]
+    mean, most, *shares = counts.summary().values()
+    return [f"{mean:.2f}", f"{most}", *(f"{100 * share:.2f} %" for share in shares)]
 
 
-def _text(image, grid, rows, others) -> str:
+def _text(image, grid, rows, second) -> str:
     head = ["mean iterations", "most", "failed tests", "cells with a failure", "cells failed wholly"]
     size = f"{len(grid.multipliers)} × {len(grid.strengths)} cells, {grid.directions:,} random directions each"
-    second = f"""
+    choices = f"""
 
 **Does the result depend on the constants that the paper leaves open?** Not for `theta`. LLG fails in a fifth of the
 tests or more at every step. Damping-only LLG fails where κ‖H‖ > 2 Ms, the limit of its explicit step: from κ0 = 0.3 on
 that is half the plane or more. At κ0 = 0.1 it fails nowhere and is about as fast as `theta-euler`. Second choices, on a
 coarser grid of 6 × 51 cells and 16 directions:
 
-{table(["dynamics", "choice", *head], others)}"""
+{table(["dynamics", "choice", *head], second)}"""
     return f"""## Fig. 9: iterations over time step and field strength
 
 **Paper:** its dynamics is violet, a single iteration or few; Kim et al. 2018 and damping-only LLG turn red, "more than
@@ -277,4 +265,4 @@ explicit dynamics have the κ0 of Fig. 8. `theta-euler` fails in weak fields (be
 
 {image}
 
-{table(["dynamics", "κ0", *head], rows)}{second if others else ""}"""
+{table(["dynamics", "κ0", *head], rows)}{choices if second else ""}"""

@@ -2,7 +2,7 @@
 
 import json
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from bench.machine import describe
@@ -19,40 +19,33 @@ words or numbers (its images are not redistributed here), and the measured one. 
 
 @dataclass
 class Output:
-    """Results of one experiment.
-
-    Attributes:
-        name: The experiment.
-        folder: Folder of the files.
-        device: Name of the Warp device.
-        small: True for the small version, for continuous integration.
-    """
+    """Results of one experiment."""
 
     name: str
-    folder: Path
-    device: str
-    small: bool
-    _machine: dict = field(default_factory=dict)
+    folder: Path  # of the files
+    device: str  # name of the Warp device
+    small: bool  # true for the small version, for continuous integration
     _started: bool = False
+
+    def __post_init__(self):
+        """Describe the machine."""
+        self._machine = describe(self.device)
 
     def record(self, **values):
         """Write a JSON line; print it without the machine and without lists."""
-        self._machine = self._machine or describe(self.device)
         line = {"experiment": self.name, "small": self.small, **values}
         print(json.dumps({key: value for key, value in line.items() if not isinstance(value, list)}))
         with open(self.folder / f"{self.name}.jsonl", "a" if self._started else "w", encoding="utf-8") as file:
             file.write(json.dumps(line | self._machine) + "\n")
         self._started = True
 
-    def save(self, figure, suffix=""):
+    def save(self, figure) -> str:
         """Write a Matplotlib figure and return the Markdown that shows it."""
-        path = self.folder / f"{self.name}{suffix}.png"
-        figure.savefig(path, dpi=110, bbox_inches="tight")
-        return f"![{self.name}]({path.name})"
+        figure.savefig(self.folder / f"{self.name}.png", dpi=110, bbox_inches="tight")
+        return f"![{self.name}]({self.name}.png)"
 
     def report(self, text: str, part: str = ""):
         """Replace this experiment's section of the report, or one part of it; keep all other sections."""
-        self._machine = self._machine or describe(self.device)
         path = self.folder / "report.md"
         sections = _read_sections(path)
         where = ", ".join(f"{self._machine[key]}" for key in ("device", "machine", "commit") if self._machine[key])

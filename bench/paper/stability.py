@@ -7,7 +7,7 @@ iterations.
 """
 
 from bench.paper.output import Output, table
-from bench.paper.trials import SCENES, Trial, outcome_cells, outcome_head, run_trials
+from bench.paper.trials import SCENES, Trial, outcome_cells, run_trials
 from warpmag.moments.dynamics import STEP
 
 SECONDS, SMALL_SECONDS = 5.0, 0.1
@@ -20,10 +20,7 @@ SATURATED = {
     "sakura_tree": {"saturation": 5e4},
 }
 """Parameters of scenes whose magnets saturate the bodies that they hold."""
-
-
-SHORT = 0.2
-"""Part of the time that kim2018 runs."""
+SHORT = 0.2  # part of the time that kim2018 runs
 VARIANTS = {
     "warpmag": {},
     "warpmag, Eq. 4": {"force": "zeeman"},
@@ -36,8 +33,7 @@ VARIANTS = {
     for step, most in ((STEP, 10), (STEP, 30), (STEP, 100), (1.0, 10), (1.0, 100))
 }  # fmt: skip
 """Runs of each scene: arguments of :class:`Trial`, parameters by scene."""
-_AT_ONCE = 6
-"""Number of runs that share a GPU; their times are not reported."""
+_AT_ONCE = 6  # number of runs that share a GPU; their times are not reported
 
 
 def run(output: Output):
@@ -48,9 +44,9 @@ def run(output: Output):
     rows = []
     for (scene, name), (_, values) in zip(runs, run_trials(trials, _AT_ONCE), strict=True):
         output.record(variant=name, **values)
-        rows.append([scene, name, *outcome_cells(values)])
-    rows.sort(key=lambda row: SCENES.index(row[0]))
-    output.report(_text(rows, seconds))
+        rows.append({"scene": scene, "method": name, **outcome_cells(values)})
+    rows.sort(key=lambda row: SCENES.index(row["scene"]))
+    output.report(_text(table(list(rows[0]), [list(row.values()) for row in rows]), seconds))
 
 
 def _trial(scene: str, seconds: float, device: str, method="warpmag", parameters=None, **settings) -> Trial:
@@ -58,7 +54,7 @@ def _trial(scene: str, seconds: float, device: str, method="warpmag", parameters
     return Trial(scene, method, seconds, device, PATIENCE, parameters=(parameters or {}).get(scene, {}), **settings)
 
 
-def _text(rows, seconds) -> str:
+def _text(results: str, seconds: float) -> str:
     balls, letters = (SATURATED[scene] for scene in ("balls_up", "alphabets"))
     return f"""## Stability: the dynamic scenes for {seconds:g} s
 
@@ -83,4 +79,4 @@ The paper states no strengths. Its "excessively strong" magnets, and its argumen
 A ball that hangs on one other ball swings forever without friction: in Balls Up a single ball may dominate the RMS. The
 median describes the others.
 
-{table(["scene", "method", *outcome_head()], rows)}"""
+{results}"""

@@ -5,8 +5,10 @@ induction and forces; times are those of the whole step. Slow pairs cost seconds
 time, and its row states the number of steps.
 """
 
+import itertools
+
 from bench.paper.output import Output, table
-from bench.paper.trials import SCENES, Trial, outcome_cells, outcome_head, run_trials
+from bench.paper.trials import SCENES, Trial, outcome_cells, run_trials
 from warpmag.declarations.magnets import PRESETS
 
 SECONDS, SMALL_SECONDS = 1.0, 0.05
@@ -31,29 +33,20 @@ def run(output: Output):
     """Run the experiment on the bundled scenes."""
     seconds = SMALL_SECONDS if output.small else SECONDS
     kind = "cpu" if output.device == "cpu" else "gpu"
-    trials = [
-        Trial(scene, method, seconds, output.device, PATIENCE[kind], rtol=RTOL)
-        for scene in SCENES
-        for method in PRESETS
-    ]
+    cases = itertools.product(SCENES, PRESETS)
+    trials = [Trial(scene, method, seconds, output.device, PATIENCE[kind], rtol=RTOL) for scene, method in cases]
     rows = []
     for trial, values in run_trials(trials):
         output.record(**values)
-        rows.append([trial.scene, trial.method, values["steps"], *_times(trial, values), *outcome_cells(values)])
-    output.report(_text(rows, kind), part=kind)
+        row = {"scene": trial.scene, "method": trial.method, "steps": values["steps"]}
+        row |= {f"T{part} [ms]": f"{values[f't{part}_ms']:.3g}" for part in "ifr"}
+        papers = PAPERS_TIMES.get((trial.scene, trial.method), ())
+        row["paper's Ti / Tf / Tr"] = " / ".join(f"{number:.3g}" for number in papers)
+        rows.append(row | outcome_cells(values))
+    output.report(_text(table(list(rows[0]), [list(row.values()) for row in rows]), kind), part=kind)
 
 
-def _times(trial: Trial, values: dict) -> list[str]:
-    def three_digits(numbers):
-        return [f"{number:.3g}" for number in numbers]
-
-    papers = PAPERS_TIMES.get((trial.scene, trial.method))
-    own = three_digits(values[key] for key in ("ti_ms", "tf_ms", "tr_ms"))
-    return [*own, " / ".join(three_digits(papers)) if papers else ""]
-
-
-def _text(rows, kind) -> str:
-    head = ["scene", "method", "steps", "Ti [ms]", "Tf [ms]", "Tr [ms]", "paper's Ti / Tf / Tr", *outcome_head()]
+def _text(results: str, kind: str) -> str:
     return f"""## Table 1 on a {kind.upper()}: time per step
 
 **Paper:** milliseconds per 1 ms step on an Intel i7-8700, 1,000 steps; its rigid bodies are Bullet's.
@@ -66,4 +59,4 @@ Induction ends at an error of {RTOL:g} or after 1,000 evaluations. The paper doe
 magnetization is converged; "until every M converges" may mean that M stopped moving, which slow pairs do long before
 their error is small. In weak fields, before a magnet has come near, pairs do not reach the relative error at all.
 
-{table(head, rows)}"""
+{results}"""

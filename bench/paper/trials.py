@@ -21,54 +21,31 @@ from warpmag.errors import SimulationError
 from warpmag.moments import dynamics
 from warpmag.scenes_usd import bundled
 
-SCENES = ("balls_up", "alphabets", "falling_magnet", "sakura_tree")
-"""The paper's dynamic scenes."""
-_CORES = 2
-"""Cores of a trial on a CPU."""
-_AS_PUBLISHED = {"balls_up": {"conductivity": 0.0}}
-"""Parameters that remove features beyond the paper's method."""
-
-
+SCENES = ("balls_up", "alphabets", "falling_magnet", "sakura_tree")  # the paper's dynamic scenes
+_CORES = 2  # cores of a trial on a CPU
+_AS_PUBLISHED = {"balls_up": {"conductivity": 0.0}}  # parameters that remove features beyond the paper's method
 _FIGURES = "magnets held held_rms_speed held_median_speed rms_speed peak_speed overlap farthest".split()
 """Statistics of a run that are reported."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One run.
+    """One run."""
 
-    Attributes:
-        scene: Name of a bundled scene.
-        method: Name of a published method, of :data:`warpmag.declarations.magnets.PRESETS`.
-        seconds: Simulated time [s].
-        device: Name of the Warp device.
-        patience: Wall time after which the run is ended [s], without the first step.
-        rtol: Magnetization error at which induction ends.
-        max_evaluations: Largest number of field evaluations of an induction.
-        pair_step: Step κ of pairs of submagnetizations, see ``warpmag.moments.dynamics``.
-        force: Force law in place of the method's own; None keeps it.
-        parameters: Parameters of the scene's script that differ from the bundled scene.
-    """
-
-    scene: str
-    method: str
-    seconds: float
-    device: str
-    patience: float
-    rtol: float = 1e-3
-    max_evaluations: int = 1000
-    pair_step: float = dynamics.STEP
-    force: str | None = None
-    parameters: dict = field(default_factory=dict)
+    scene: str  # name of a bundled scene
+    method: str  # name of a published method, of :data:`warpmag.declarations.magnets.PRESETS`
+    seconds: float  # simulated time [s]
+    device: str  # name of the Warp device
+    patience: float  # wall time after which the run is ended [s], without the first step
+    rtol: float = 1e-3  # magnetization error at which induction ends
+    max_evaluations: int = 1000  # largest number of field evaluations of an induction
+    pair_step: float = dynamics.STEP  # step κ of pairs of submagnetizations, see ``warpmag.moments.dynamics``
+    force: str | None = None  # force law in place of the method's own; None keeps it
+    parameters: dict = field(default_factory=dict)  # parameters of the scene's script that differ from its defaults
 
 
 def run_trials(trials: Sequence[Trial], workers: int = 1) -> Iterator[tuple[Trial, dict]]:
-    """Run trials and yield each with its outcome, in their order.
-
-    Args:
-        trials: The trials, all on one device.
-        workers: Number of trials at once on a GPU.
-    """
+    """Run trials on one device, ``workers`` at once on a GPU; yield each with its outcome, in their order."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     if trials and trials[0].device == "cpu":
         workers = max(1, len(cores) // _CORES)
@@ -123,37 +100,25 @@ def _load(trial: Trial, folder: Path) -> warpmag.Simulation:
     if parameters:
         stage = folder / f"{trial.scene}.usdc"
         import_module(f"warpmag.scenes_usd.{trial.scene}").author(stage, **parameters)
+    settings = {"rtol": trial.rtol, "max_evaluations": trial.max_evaluations, "device": trial.device}
+    settings |= {"dynamics": method.dynamics, "curve": method.curve, "force": trial.force or method.force}
     with mock.patch.object(dynamics, "STEP", trial.pair_step):  # scenes have no attribute for it
-        return warpmag.Simulation(
-            stage,
-            dynamics=method.dynamics,
-            curve=method.curve,
-            force=trial.force or method.force,
-            rtol=trial.rtol,
-            max_evaluations=trial.max_evaluations,
-            device=trial.device,
-        )
+        return warpmag.Simulation(stage, **settings)
 
 
-def outcome_head() -> list[str]:
-    """Column heads of :func:`outcome_cells`."""
-    head = ["substeps per step", "field evaluations per substep", "substeps not converged", "held"]
-    head += ["RMS speed of these [cm/s]", "median", "of all, RMS", "peak [m/s]"]
-    return [*head, "farthest [m]", "penetration", "end"]
-
-
-def outcome_cells(values: dict) -> list[str]:
-    """Outcome of a scene as cells of a table."""
-    return [
-        f"{values['substeps']:.1f}",
-        f"{values['evaluations_per_substep']:.1f}",
-        f"{100.0 * values['unconverged']:.0f} %",
-        f"{values['held']} of {values['magnets']}" if values["held"] else "",
-        f"{100.0 * values['held_rms_speed']:.2f}" if values["held"] else "",
-        f"{100.0 * values['held_median_speed']:.2f}" if values["held"] else "",
-        f"{100.0 * values['rms_speed']:.2f}",
-        f"{values['peak_speed']:.2f}",
-        f"{values['farthest']:.3f}",
-        f"{100.0 * values['overlap']:.1f} %",
-        values["ended"] or f"{values['simulated']:.2f} s",
-    ]
+def outcome_cells(values: dict) -> dict[str, str]:
+    """Outcome of a scene as cells of a table, by the heads of their columns."""
+    held = values["held"]
+    return {
+        "substeps per step": f"{values['substeps']:.1f}",
+        "field evaluations per substep": f"{values['evaluations_per_substep']:.1f}",
+        "substeps not converged": f"{100.0 * values['unconverged']:.0f} %",
+        "held": f"{held} of {values['magnets']}" if held else "",
+        "RMS speed of these [cm/s]": f"{100.0 * values['held_rms_speed']:.2f}" if held else "",
+        "median": f"{100.0 * values['held_median_speed']:.2f}" if held else "",
+        "of all, RMS": f"{100.0 * values['rms_speed']:.2f}",
+        "peak [m/s]": f"{values['peak_speed']:.2f}",
+        "farthest [m]": f"{values['farthest']:.3f}",
+        "penetration": f"{100.0 * values['overlap']:.1f} %",
+        "end": values["ended"] or f"{values['simulated']:.2f} s",
+    }

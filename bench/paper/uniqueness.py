@@ -41,39 +41,27 @@ square of the bar's strength, as (s − tanh s)/s does, so it is the curves' alo
 
 
 def _solve(dynamics: str, strength: float, curve: str, device: str, rtol=RTOL):
-    system = crystal_balls.make_system(
-        strength, dynamics, device, curve=curve, rtol=rtol, max_evaluations=MOST[dynamics], dtype="float64"
-    )
-    if dynamics != "theta":
-        crystal_balls.set_pairs(system, "across")
+    settings = {"curve": curve, "rtol": rtol, "max_evaluations": MOST[dynamics], "dtype": "float64"}
+    system = crystal_balls.make_system(strength, dynamics, device, **settings)
     system.solve()
     return system, system.magnetizations().numpy()[: len(crystal_balls.layout().balls)]
 
 
-def _distance(a, b) -> float:
-    return float(np.linalg.norm(a - b) / np.linalg.norm(b))
-
-
 def _agreement(strength: str, curve: str, output: Output) -> list[list]:
     """Compare all dynamics on one curve under one bar."""
-    bar = crystal_balls.STRENGTHS[strength]
-    newton = oracle.equilibrium(
-        crystal_balls.layout().balls,
-        crystal_balls.BALL_RADIUS,
-        crystal_balls.applied_field(bar),
-        saturation=SATURATION_OF_IRON,
-        curve=curve,
-    ).magnetizations
-    rows, own = [], None
+    bar, balls = crystal_balls.STRENGTHS[strength], (crystal_balls.layout().balls, crystal_balls.BALL_RADIUS)
+    material = {"saturation": SATURATION_OF_IRON, "curve": curve}
+    newton = oracle.equilibrium(*balls, crystal_balls.applied_field(bar), **material).magnetizations
+    rows, theta = [], None
     for dynamics in DYNAMICS:
         system, m = _solve(dynamics, bar, curve, output.device)
-        own = m if dynamics == "theta" else own
+        theta = m if dynamics == "theta" else theta
         converged = bool(system.converged.numpy()[0])
         values = {
             "iterations": int(system.evaluations.numpy()[0]),
             "residual": float(system.residual.numpy()[0]),
-            "from_newton": _distance(m, newton),
-            "from_theta": _distance(m, own),
+            "from_newton": oracle.relative(m, newton),
+            "from_theta": oracle.relative(m, theta),
         }
         output.record(strength=strength, curve=curve, dynamics=dynamics, converged=converged, **values)
         count = values.pop("iterations") if converged else f"not in {values.pop('iterations')}"
@@ -84,7 +72,7 @@ def _agreement(strength: str, curve: str, output: Output) -> list[list]:
 def _curves_apart(bar: float, output: Output) -> list[str]:
     """Return the row of the paper's own comparison, which mixes curves."""
     _, kim = _solve("llg", bar, "clamped", output.device, rtol=1e-6)
-    _, ours = _solve("theta", bar, "tanh", output.device, rtol=1e-6)
-    deviation = float(np.mean(np.linalg.norm(kim - ours, axis=1) / np.linalg.norm(kim, axis=1)))
+    _, theta = _solve("theta", bar, "tanh", output.device, rtol=1e-6)
+    deviation = float(np.mean(np.linalg.norm(kim - theta, axis=1) / np.linalg.norm(kim, axis=1)))
     output.record(bar=bar, mean_deviation=deviation)
     return [f"{bar:g}", f"{deviation:.1e}"]

@@ -15,19 +15,12 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A field evaluation that is ready to run.
+    """A field evaluation that is ready to run."""
 
-    Attributes:
-        run: Starts one evaluation.
-        wait: Waits for all evaluations that were started.
-        result: Returns the field [A/m] of the last evaluation, shape [n, 3].
-        kept: Objects that must live as long as this one: a captured graph does not hold the arrays that it uses.
-    """
-
-    run: Callable[[], object]
-    wait: Callable[[], object]
-    result: Callable[[], np.ndarray]
-    kept: object = None
+    run: Callable[[], object]  # starts one evaluation
+    wait: Callable[[], object]  # waits for all evaluations that were started
+    result: Callable[[], np.ndarray]  # field [A/m] of the last evaluation, shape [n, 3]
+    kept: object = None  # lives as long as this object: a captured graph does not hold the arrays that it uses
 
 
 def evaluation_of(compute, *, wait=lambda value: None, result=np.asarray) -> Evaluation:
@@ -42,21 +35,13 @@ def evaluation_of(compute, *, wait=lambda value: None, result=np.asarray) -> Eva
 
 @dataclass(frozen=True)
 class Peer:
-    """A function of a module of this folder.
-
-    Attributes:
-        name: Name of the function.
-        module: Name of the module.
-        summary: Library and method.
-        devices: Devices that it runs on, ``cpu``, ``cuda`` or both.
-        charges: True if it sums the field of point charges, shape [n]; only ``many`` runs such peers.
-    """
+    """A function of a module of this folder."""
 
     name: str
     module: str
-    summary: str
-    devices: tuple[str, ...]
-    charges: bool = False
+    summary: str  # library and method
+    devices: tuple[str, ...]  # devices that it runs on, ``cpu``, ``cuda`` or both
+    charges: bool = False  # true if it sums the field of point charges, shape [n]; only ``many`` runs such peers
 
     def prepare(self, positions, moments, device) -> Evaluation:
         """Call the function; an error if its library is not installed."""
@@ -72,7 +57,6 @@ PEERS = (
     Peer("jax", "with_jax", "JAX: broadcast over blocks of targets, jit", ("cpu", "cuda")),
     Peer("numba_cpu", "with_numba", "Numba: parallel, fastmath loop", ("cpu",)),
     Peer("numba_cuda", "with_numba", "Numba CUDA: sources staged in shared memory", ("cuda",)),
-    Peer("cupy", "with_arrays", "CuPy: broadcast over blocks of targets", ("cuda",)),
     Peer("pykeops", "with_arrays", "KeOps: symbolic matrix, reduced without being stored", ("cpu", "cuda")),
     Peer("magpylib", "with_arrays", "magpylib: its dipole formula over all pairs, float64", ("cpu",)),
     Peer("fmm3d", "with_arrays", "FMM3D: fast multipole method, eps 1e-3, float64", ("cpu",)),

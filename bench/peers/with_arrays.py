@@ -1,4 +1,4 @@
-"""CuPy, KeOps, magpylib and FMM3D: each function imports its own library, since they are installed separately."""
+"""KeOps, magpylib and FMM3D: each function imports its own library, since they are installed separately."""
 
 from typing import Any
 
@@ -6,30 +6,8 @@ import numpy as np
 
 from bench.peers import Evaluation, evaluation_of
 
-_CUPY_PAIRS, _MAGPYLIB_PAIRS = 1 << 26, 1 << 20
-"""Pairs of one block."""
-_EPS = 1e-3
-"""Relative precision of FMM3D."""
-
-
-def cupy(positions, moments, device) -> Evaluation:
-    """Broadcast over a block of targets; every intermediate matrix of pairs is stored."""
-    import cupy as library  # noqa: PLC0415
-
-    x, m = (library.asarray(a) for a in (positions, moments))
-    block = max(1, _CUPY_PAIRS // len(x))
-    h = library.empty_like(x)
-
-    def run():
-        for begin in range(0, len(x), block):
-            r = x[begin : begin + block, None, :] - x[None, :, :]
-            d2 = (r * r).sum(-1)
-            inv = library.where(d2 > 0.0, d2, np.float32(np.inf)) ** np.float32(-0.5)
-            rm = (r * m).sum(-1)
-            inv3 = inv * inv * inv
-            h[begin : begin + block] = ((3.0 * rm * inv3 * inv * inv)[..., None] * r - inv3[..., None] * m).sum(1)
-
-    return Evaluation(run, library.cuda.runtime.deviceSynchronize, lambda: h.get() / np.float32(4.0 * np.pi))
+_PAIRS = 1 << 20  # pairs of one block of magpylib
+_EPS = 1e-3  # relative precision of FMM3D
 
 
 def pykeops(positions, moments, device) -> Evaluation:
@@ -55,7 +33,7 @@ def magpylib(positions, moments, device) -> Evaluation:
 
     x, m = positions.astype(float), moments.astype(float)
     n = len(x)
-    block = max(1, _MAGPYLIB_PAIRS // n)
+    block = max(1, _PAIRS // n)
     h = np.empty((n, 3))
 
     def run():

@@ -18,24 +18,15 @@ from scipy.special import sph_harm_y
 
 from bench.reference.near_contact import smoothstep
 from bench.reference.oracle import MU0
-from warpmag.kernels.near_contact.contact_table import (
-    CELL_DEPTH,
-    CELL_SIZE,
-    LEAST_MAGNET,
-    MAGNET_OVERLAP,
-    MAGNET_REACH,
-)
+from warpmag.kernels.near_contact.contact_table import CELL_DEPTH, CELL_SIZE, LEAST_MAGNET, MAGNET_OVERLAP, MAGNET_REACH
 
 
-def image_force(places, charges, radius: float) -> np.ndarray:
-    """Force [N] of point charges on a ball of infinite permeability at the origin, shape [3].
+def image_force(positions, charges, radius: float) -> np.ndarray:
+    """Force [N] on a ball of infinite permeability at the origin, shape [3].
 
-    Args:
-        places: Places of the charges outside the ball [m], shape [n, 3].
-        charges: Magnetic charges [A·m], shape [n]; a dipole is two of them.
-        radius: Radius of the ball [m].
+    ``charges`` are magnetic charges [A·m] at ``positions`` outside the ball [m], shape [n, 3]; a dipole is two of them.
     """
-    x, q = np.asarray(places, float), np.asarray(charges, float)
+    x, q = np.asarray(positions, float), np.asarray(charges, float)
     s = np.linalg.norm(x, axis=1)
     at = np.concatenate([x * (radius / s)[:, None] ** 2, np.zeros_like(x)])
     images = np.concatenate([-q * radius / s, q * radius / s])
@@ -44,22 +35,18 @@ def image_force(places, charges, radius: float) -> np.ndarray:
     return MU0 * images @ field
 
 
-def dipole_charges(place, moment, size: float):
-    """Places and values of two charges ``size`` [m] apart that make a moment [A·m²]."""
+def dipole_charges(position, moment, distance: float):
+    """Positions [m] and values [A·m] of two charges at a ``distance`` [m] that make a moment [A·m²]."""
     along = np.asarray(moment, float) / np.linalg.norm(moment)
-    q = np.linalg.norm(moment) / size
-    return np.stack([place + 0.5 * size * along, place - 0.5 * size * along]), np.array([q, -q])
+    q = np.linalg.norm(moment) / distance
+    return np.stack([position + 0.5 * distance * along, position - 0.5 * distance * along]), np.array([q, -q])
 
 
 def dipole_pull(distance, radius: float, susceptibility: float, along: bool, order=400) -> float:
-    """Pull [N] of a unit moment [A·m²] on a ball, summed over degrees.
+    """Attraction [N] of a ball by a unit moment [A·m²] at a ``distance`` from its center [m], summed over degrees.
 
-    Args:
-        distance: Distance of the moment from the ball's center [m].
-        radius: Radius of the ball [m].
-        susceptibility: χ of the ball, may be infinite.
-        along: True for a moment that points to the ball, false for one perpendicular to that.
-        order: Highest degree.
+    The moment points to the ball if ``along``, else perpendicular to that. χ may be infinite; ``order`` is the highest
+    degree.
     """
     degree = np.arange(1, order + 1)
     weight = (degree + 1.0) ** 2 if along else 0.5 * degree * (degree + 1.0)
@@ -71,12 +58,7 @@ def dipole_pull(distance, radius: float, susceptibility: float, along: bool, ord
 def force_in_field(field, center, radius: float, susceptibility=np.inf, order=40) -> np.ndarray:
     """Force [N] on a ball in the field of magnets outside of it, shape [3].
 
-    Args:
-        field: Function of points [m], shape [p, 3], that returns H [A/m] of the same shape.
-        center: Center of the ball [m], shape [3].
-        radius: Radius of the ball [m].
-        susceptibility: χ of the ball, may be infinite.
-        order: Highest degree.
+    ``field`` returns H [A/m] at points [m], shape [p, 3]. χ may be infinite; ``order`` is the highest degree.
     """
     nodes, weights = np.polynomial.legendre.leggauss(order + 16)
     count = 2 * order + 32
@@ -95,12 +77,9 @@ def force_in_field(field, center, radius: float, susceptibility=np.inf, order=40
 
 
 def box_field(points, half, magnetization: float) -> np.ndarray:
-    """Field H [A/m] outside a centered box magnetized along z, edges along the axes (Akoun and Yonnet 1984).
+    """Field H [A/m] at points [m], shape [p, 3], outside a centered box magnetized along z (Akoun and Yonnet 1984).
 
-    Args:
-        points: Places [m], shape [p, 3].
-        half: Half extents [m], shape [3].
-        magnetization: Magnetization along z [A/m].
+    The edges are along the axes; ``half`` are the half extents [m], shape [3].
     """
     total = np.zeros_like(points)
     for corner in itertools.product((-1.0, 1.0), repeat=3):
@@ -115,9 +94,7 @@ def _response(degree, susceptibility):
     return degree / (degree + (2.0 * degree + 1.0) / susceptibility)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# The model of the near-contact kernels
-# ---------------------------------------------------------------------------------------------------------------------
+# ---------- The model of the near-contact kernels ----------
 
 
 def model_weight(distance, radius, magnet_radius, alone):
@@ -134,14 +111,8 @@ def model_weight(distance, radius, magnet_radius, alone):
 def model_energy(center, radius, susceptibility, positions, radii, moments, alone):
     """Energy [J] of the multipoles of degree 2 and more of an inducible ball, by Legendre polynomials.
 
-    Args:
-        center: Center of the ball [m], shape [3].
-        radius: Radius of the ball [m].
-        susceptibility: χ of the ball, may be infinite.
-        positions: Places of the permanent moments [m], shape [n, 3].
-        radii: Radii of their balls [m], shape [n].
-        moments: Moments [A·m²], shape [n, 3].
-        alone: True for each moment that is the only one of its body, shape [n].
+    ``positions`` [m], ``radii`` [m] and ``moments`` [A·m²] are those of n permanent moments; ``alone`` is true for each
+    moment that is the only one of its body.
     """
     s = (np.asarray(positions, float) - center) / radius
     d = np.linalg.norm(s, axis=1)

@@ -22,8 +22,7 @@ from warpmag.shapes import demagnetization, lattice, uniform_response
 SUSCEPTIBILITIES = (1.0, 10.0, 1000.0, math.inf)
 LINEAR = 1e12
 """Saturation far above any field here [A/m]."""
-STRENGTH = 1e3
-"""Applied field [A/m]."""
+STRENGTH = 1e3  # applied field [A/m]
 
 
 def ellipsoid_moments(semi_axes, susceptibilities=SUSCEPTIBILITIES) -> np.ndarray:

@@ -31,8 +31,8 @@ def positions(cluster: str, gap: float) -> np.ndarray:
     if cluster == "chain":
         return (2.0 + gap) * np.outer(np.arange(3.0), [0.0, 0.0, 1.0])
     corners = np.array([[a, b, 0.0] for a in (1.0, -1.0) for b in (1.0, -1.0)])
-    turned = [np.zeros((1, 3)), corners, corners[:, [0, 2, 1]], corners[:, [2, 0, 1]]]
-    return (2.0 + gap) / np.sqrt(2.0) * np.concatenate(turned)
+    centers = [np.zeros((1, 3)), corners, corners[:, [0, 2, 1]], corners[:, [2, 0, 1]]]
+    return (2.0 + gap) / np.sqrt(2.0) * np.concatenate(centers)
 
 
 def solve(cluster: str, gap: float, permeabilities=PERMEABILITIES) -> dict[tuple[float, str], Solution]:

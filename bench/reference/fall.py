@@ -17,24 +17,17 @@ from bench.reference import oracle
 RADIUS, SATURATION, DENSITY = 0.005, 1.7e6, 7870.0
 FIELD = np.array([2e5, 0.0, 1e5])
 """Applied field [A/m]; it magnetizes the balls to a third of their saturation."""
-DURATION = 0.01
-"""Time [s] in which the distance of two balls falls from 4.4 to 3.1 radii."""
+DURATION = 0.01  # time [s] in which the distance of two balls falls from 4.4 to 3.1 radii
 BALLS = RADIUS * np.array([[0.0, 0.0, 0.0], [4.4, 0.0, 0.0], [1.32, 3.96, 0.88]])
 
 
 @dataclass(frozen=True)
 class Fall:
-    """Result of a fall.
+    """Result of a fall."""
 
-    Attributes:
-        drift: Largest change of the total energy over the kinetic energy gained.
-        momentum: Largest total momentum over the sum of the balls' momenta.
-        positions: Final positions of the balls [m], shape [count, 3].
-    """
-
-    drift: float
-    momentum: float
-    positions: np.ndarray
+    drift: float  # largest change of the total energy over the kinetic energy gained
+    momentum: float  # largest total momentum over the sum of the balls' momenta
+    positions: np.ndarray  # final positions of the balls [m], shape [count, 3]
 
 
 def free_energy(positions) -> float:
@@ -52,8 +45,8 @@ def fall(count: int, dt: float, device, *, force: str = "kelvin") -> Fall:
     builder = newton.ModelBuilder()
     builder.gravity = wp.vec3(0.0, 0.0, 0.0)
     warpmag.register_attributes(builder)
-    for place in BALLS[:count]:
-        body = builder.add_body(xform=wp.transform(wp.vec3(*place), wp.quat_identity()))
+    for center in BALLS[:count]:
+        body = builder.add_body(xform=wp.transform(wp.vec3(*center), wp.quat_identity()))
         builder.add_shape_sphere(body, radius=RADIUS, cfg=newton.ModelBuilder.ShapeConfig(density=DENSITY))
         warpmag.add_inducible(builder, body)
     model = builder.finalize(device=device)

@@ -13,8 +13,7 @@ from scipy.special import j1
 
 from bench.reference.oracle import MU0
 
-CUBE, PLATE, BAR = (1.0, 1.0, 1.0), (1.0, 1.0, 0.2), (0.3, 0.3, 1.0)
-"""Half extents of boxes of side 2."""
+CUBE, PLATE, BAR = (1.0, 1.0, 1.0), (1.0, 1.0, 0.2), (0.3, 0.3, 1.0)  # half extents of boxes of side 2
 PAIRS = {
     "cubes in line": (CUBE, CUBE, 2, 0.0),
     "cubes side by side": (CUBE, CUBE, 0, 0.0),
@@ -28,14 +27,11 @@ PAIRS = {
 def box_pair(name: str, gap: float, side: float):
     """Half extents [m] of the two boxes of a pair of ``PAIRS``, and offset of the second box [m], shape [3] each.
 
-    Args:
-        name: Key of ``PAIRS``.
-        gap: Distance between the faces, in sides.
-        side: Longest edge of the boxes [m].
+    ``gap`` is the distance between the faces over ``side``, the longest edge of the boxes [m].
     """
-    half1, half2, axis, aside = PAIRS[name]
+    half1, half2, axis, lateral = PAIRS[name]
     offset = np.zeros(3)
-    offset[0] = aside * side
+    offset[0] = lateral * side
     offset[axis] = (0.5 * (half1[axis] + half2[axis]) + gap) * side
     return 0.5 * side * np.array(half1), 0.5 * side * np.array(half2), offset
 
@@ -46,11 +42,9 @@ def box_force(half1, half2, offset, magnetization1: float, magnetization2: float
     The boxes are charged sheets: each pair of corners adds one term of an integral in closed form.
 
     Args:
-        half1: Half extents of the first box [m], shape [3].
-        half2: Half extents of the second box [m], shape [3].
+        half1, half2: Half extents of the boxes [m], shape [3].
         offset: Center of the second box relative to the first [m], shape [3]; the boxes do not overlap.
-        magnetization1: Magnetization of the first box along z [A/m].
-        magnetization2: Magnetization of the second box along z [A/m].
+        magnetization1, magnetization2: Magnetizations along z [A/m].
     """
     total = np.zeros(3)
     for signs in itertools.product((-1.0, 1.0), repeat=6):

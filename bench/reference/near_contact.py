@@ -56,15 +56,10 @@ def quadrupole_window(distance, radius_i, radius_j):
 
 
 def conductances(gap, own, other):
-    """The 14 functions A to P of pairs, and their derivatives with respect to the gap.
+    """The 14 functions A to P of pairs, and their derivatives with respect to the gap, shape [p, 14] each.
 
-    Args:
-        gap: Gap between the surfaces over the radius, shape [p].
-        own: :func:`hardness` of the ball, shape [p].
-        other: :func:`hardness` of the other ball, shape [p].
-
-    Returns:
-        Functions and derivatives [dimensionless], shape [p, 14] each.
+    ``gap`` is the gap between the surfaces over the radius; ``own`` and ``other`` are the :func:`hardness` of a ball
+    and of its neighbor, shape [p].
     """
     gap = np.asarray(gap, float)
     u, du = log_gap(gap)
@@ -97,9 +92,7 @@ def crowding_weight(shared):
     return 1.0 - smoothstep((shared - MOST_SHARED[0]) / (MOST_SHARED[1] - MOST_SHARED[0]))[0]
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# The short-range potential
-# ---------------------------------------------------------------------------------------------------------------------
+# ---------- The short-range potential ----------
 
 
 def long_range(distance, radius_i, radius_j):
@@ -128,9 +121,7 @@ def averaged_potential(d, a, b):
     return np.select([d <= np.abs(a - b), d < s], [inside, polynomial / (160.0 * p**3)], 1.0 / apart)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Reference implementation, dense
-# ---------------------------------------------------------------------------------------------------------------------
+# ---------- Reference implementation, dense ----------
 
 _HALF_ROOT = 0.5 * np.sqrt(3.0)
 _BASIS = np.array(
@@ -370,24 +361,19 @@ class NearContacts:
         return -(radial[:, None] * n + (weight / d)[:, None] * turn)
 
 
-def equilibrium(positions, radii, h0, *, saturation, susceptibility=np.inf, curve="tanh", iterations=60):
-    """Magnetic equilibrium and Kelvin forces of balls in uniform fields, with the near-contact model.
+def equilibrium(positions, radii, h0, *, saturation, susceptibility=np.inf, curve="tanh"):
+    """Equilibrium (``oracle.Equilibrium``) and forces [N], shape [n, 3], of balls with the near-contact model.
 
     Arguments are those of ``oracle.equilibrium``. The weights of the balls' saturation are iterated.
-
-    Returns:
-        The equilibrium (``oracle.Equilibrium``) and the forces [N], shape [n, 3].
     """
     positions = np.asarray(positions, float)
     n = len(positions)
     volumes = 4.0 / 3.0 * np.pi * np.broadcast_to(np.asarray(radii, float), n) ** 3
-    weights = np.ones(n)
-    for _ in range(iterations):
+    weights, material = np.ones(n), {"saturation": saturation, "susceptibility": susceptibility, "curve": curve}
+    for _ in range(60):
         near = NearContacts(positions, radii, susceptibility, weights)
-        solution = oracle.equilibrium(
-            positions, radii, h0, saturation=saturation, susceptibility=susceptibility, curve=curve,
-            extra_coupling=near.coupling() * np.repeat(volumes, 3),
-        )  # fmt: skip
+        coupling = near.coupling() * np.repeat(volumes, 3)
+        solution = oracle.equilibrium(positions, radii, h0, **material, extra_coupling=coupling)
         last, weights = weights, saturation_weight(solution.h, saturation, susceptibility, curve)
         if np.abs(weights - last).max() < 1e-10:
             break

@@ -19,13 +19,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MU0 = 4e-7 * math.pi
-"""Vacuum permeability [T·m/A], the conventional value."""
+MU0 = 4e-7 * math.pi  # vacuum permeability [T·m/A], the conventional value
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Pair law
-# ---------------------------------------------------------------------------------------------------------------------
+def relative(values, expected) -> float:
+    """L2 norm of the error of ``values`` over the L2 norm of the expected ones."""
+    return float(np.linalg.norm(values - expected) / np.linalg.norm(expected))
+
+
+# ---------- Pair law ----------
 
 
 def radial_factors(distance, radius_i, radius_j, smoothing=0.0):
@@ -94,28 +96,24 @@ def _overlap_factors(d, a, b):
     return g1, g2, g3
 
 
-def _pairs(positions, targets, radii, target_radii, smoothing, exclude):
-    """Separations [t, n, 3] and radial factors [t, n] of all targets and sources; excluded pairs are zero."""
-    r = targets[:, None, :] - positions[None, :, :]
-    d = np.sqrt(np.einsum("tnk,tnk->tn", r, r))
-    g1, g2, g3 = radial_factors(d, target_radii[:, None], radii[None, :], smoothing)
-    if exclude is not None:
-        g1, g2, g3 = (np.where(exclude, 0.0, g) for g in (g1, g2, g3))
-    return r, g1, g2, g3
-
-
-def _prepare(positions, moments, targets, radii, target_radii, bodies):
-    positions, moments = np.asarray(positions, float), np.asarray(moments, float)
-    radii = np.zeros(len(positions)) if radii is None else np.broadcast_to(np.asarray(radii, float), len(positions))
+def _pairs(positions, targets=None, *, radii=None, target_radii=None, bodies=None, smoothing=0.0, chunk=256):
+    """Yield separations [t, n, 3] and radial factors [t, n] of ``chunk`` targets at a time; see :func:`h_field`."""
+    positions = np.asarray(positions, float)
+    radii = np.broadcast_to(0.0 if radii is None else np.asarray(radii, float), len(positions))
+    same_body = None
     if targets is None:
-        ids = np.arange(len(positions)) if bodies is None else np.asarray(bodies)
-        return positions, moments, positions, radii, radii, ids[:, None] == ids[None, :]
+        bodies = np.arange(len(positions)) if bodies is None else np.asarray(bodies)
+        targets, target_radii, same_body = positions, radii, bodies[:, None] == bodies
     targets = np.asarray(targets, float)
-    target_radii = 0.0 if target_radii is None else np.asarray(target_radii, float)
-    return positions, moments, targets, radii, np.broadcast_to(target_radii, len(targets)), None
+    target_radii = np.broadcast_to(0.0 if target_radii is None else np.asarray(target_radii, float), len(targets))
+    for start in range(0, len(targets), chunk):
+        rows = slice(start, start + chunk)
+        r = targets[rows, None] - positions
+        factors = radial_factors(np.sqrt(np.einsum("tnk,tnk->tn", r, r)), target_radii[rows, None], radii, smoothing)
+        yield r, *(factors if same_body is None else (np.where(same_body[rows], 0.0, g) for g in factors))
 
 
-def h_field(positions, moments, targets=None, *, radii=None, target_radii=None, bodies=None, smoothing=0.0, chunk=256):
+def h_field(positions, moments, targets=None, **settings):
     """Field of moments at targets, or at each other (Eq. 1, with the ball-averaged law for overlapping balls).
 
     Args:
@@ -131,48 +129,26 @@ def h_field(positions, moments, targets=None, *, radii=None, target_radii=None, 
     Returns:
         H [A/m], shape [t, 3].
     """
-    positions, moments, targets, radii, target_radii, exclude = _prepare(
-        positions, moments, targets, radii, target_radii, bodies
-    )
-    h = np.empty_like(targets)
-    for start in range(0, len(targets), chunk):
-        rows = slice(start, start + chunk)
-        r, g1, g2, _ = _pairs(
-            positions, targets[rows], radii, target_radii[rows], smoothing, None if exclude is None else exclude[rows]
-        )
+    moments, parts = np.asarray(moments, float), [np.empty((0, 3))]
+    for r, g1, g2, _ in _pairs(positions, targets, **settings):
         rm = np.einsum("tnk,nk->tn", r, moments)
-        h[rows] = (g1 @ moments + np.einsum("tn,tnk->tk", g2 * rm, r)) / (4.0 * np.pi)
-    return h
+        parts.append((g1 @ moments + np.einsum("tn,tnk->tk", g2 * rm, r)) / (4.0 * np.pi))
+    return np.concatenate(parts)
 
 
-def field_gradient(
-    positions, moments, targets=None, *, radii=None, target_radii=None, bodies=None, smoothing=0.0, chunk=256
-):
+def field_gradient(positions, moments, targets=None, **settings):
     """Gradient ∂H_k/∂x_l [A/m²] of the moments' field, shape [t, 3, 3]; arguments as in :func:`h_field`."""
-    positions, moments, targets, radii, target_radii, exclude = _prepare(
-        positions, moments, targets, radii, target_radii, bodies
-    )
-    gradients = np.empty((len(targets), 3, 3))
-    for start in range(0, len(targets), chunk):
-        rows = slice(start, start + chunk)
-        pairs = _pairs(
-            positions, targets[rows], radii, target_radii[rows], smoothing, None if exclude is None else exclude[rows]
-        )
-        gradients[rows] = _sum_gradients(moments, *pairs)
-    return gradients
+    moments, parts = np.asarray(moments, float), [np.empty((0, 3, 3))]
+    for r, _, g2, g3 in _pairs(positions, targets, **settings):
+        rm = np.einsum("tnk,nk->tn", r, moments)
+        outer = np.einsum("tn,tnk,nl->tkl", g2, r, moments)
+        trace = np.einsum("tn,tn->t", g2, rm)[:, None, None] * np.eye(3)
+        along = np.einsum("tn,tnk,tnl->tkl", g3 * rm, r, r)
+        parts.append((outer + outer.transpose(0, 2, 1) + trace + along) / (4.0 * np.pi))
+    return np.concatenate(parts)
 
 
-def _sum_gradients(moments, r, _, g2, g3):
-    rm = np.einsum("tnk,nk->tn", r, moments)
-    outer = np.einsum("tn,tnk,nl->tkl", g2, r, moments)
-    trace = np.einsum("tn,tn->t", g2, rm)[:, None, None] * np.eye(3)
-    along = np.einsum("tn,tnk,tnl->tkl", g3 * rm, r, r)
-    return (outer + outer.transpose(0, 2, 1) + trace + along) / (4.0 * np.pi)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Magnetization curves
-# ---------------------------------------------------------------------------------------------------------------------
+# ---------- Magnetization curves ----------
 
 
 def curve_slope(susceptibility):
@@ -222,9 +198,7 @@ def magnetization(h, saturation, susceptibility=math.inf, curve="tanh"):
     return ms[:, None] * value[:, None] * unit, derivative
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Force and torque
-# ---------------------------------------------------------------------------------------------------------------------
+# ---------- Force and torque ----------
 
 
 def kelvin_force(moments, gradients):
@@ -243,9 +217,7 @@ def torque(moments, h):
     return MU0 * np.cross(np.asarray(moments, float), h)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Induction
-# ---------------------------------------------------------------------------------------------------------------------
+# ---------- Induction ----------
 
 
 @dataclass
@@ -262,7 +234,7 @@ def coupling_matrix(positions, radii):
     positions = np.asarray(positions, float)
     n = len(positions)
     radii = np.broadcast_to(np.asarray(radii, float), n)
-    r, g1, g2, _ = _pairs(positions, positions, radii, radii, 0.0, np.eye(n, dtype=bool))
+    r, g1, g2, _ = next(_pairs(positions, radii=radii, chunk=n))
     volumes = 4.0 / 3.0 * np.pi * radii**3
     blocks = g1[:, :, None, None] * np.eye(3) + g2[:, :, None, None] * r[:, :, :, None] * r[:, :, None, :]
     blocks *= volumes[None, :, None, None] / (4.0 * np.pi)
@@ -270,16 +242,7 @@ def coupling_matrix(positions, radii):
 
 
 def equilibrium(
-    positions,
-    radii,
-    h0,
-    *,
-    saturation,
-    susceptibility=math.inf,
-    curve="tanh",
-    extra_coupling=None,
-    tolerance=1e-13,
-    iterations=200,
+    positions, radii, h0, *, saturation, susceptibility=math.inf, curve="tanh", extra_coupling=0.0, tolerance=1e-13
 ):
     """Magnetic equilibrium M = f(H0 + G M) by damped Newton iterations on the dense system.
 
@@ -292,14 +255,10 @@ def equilibrium(
         saturation: Saturation magnetization Ms [A/m], scalar or [n].
         susceptibility: Susceptibility [dimensionless], scalar or [n], may be infinite.
         curve: Magnetization curve, see :func:`reduced_curve`.
-        extra_coupling: Matrix added to the dipoles' coupling G, shape [3n, 3n]; None adds nothing.
+        extra_coupling: Matrix added to the dipoles' coupling G, shape [3n, 3n].
         tolerance: Relative residual at which to stop.
-        iterations: Largest number of Newton iterations.
-
-    Returns:
-        The equilibrium, with its residual.
     """
-    g = coupling_matrix(positions, radii) + (0.0 if extra_coupling is None else extra_coupling)
+    g = coupling_matrix(positions, radii) + extra_coupling
     n = len(g) // 3
     h0 = np.broadcast_to(np.asarray(h0, float), (n, 3)).copy()
     h = h0.copy()
@@ -310,7 +269,7 @@ def equilibrium(
 
     value, m, derivative = residual(h)
     scale = max(np.linalg.norm(h0), np.finfo(float).tiny)
-    for _ in range(iterations):
+    for _ in range(200):
         size = np.linalg.norm(value)
         if size <= tolerance * max(scale, np.linalg.norm(h)):
             break
@@ -329,9 +288,7 @@ def equilibrium(
     return Equilibrium(m, h, float(np.linalg.norm(value) / max(np.linalg.norm(h), np.finfo(float).tiny)))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Eddy currents
-# ---------------------------------------------------------------------------------------------------------------------
+# ---------- Eddy currents ----------
 
 
 def eddy_coefficient(radii, conductivity):

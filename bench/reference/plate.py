@@ -12,15 +12,12 @@ import itertools
 
 import numpy as np
 
-from bench.reference.oracle import MU0
+from bench.reference.oracle import MU0, relative
 from bench.reference.surface_integrals import potentials, rectangles_of, solved_charges
 
-MAGNET, MAGNETIZATION = 0.02, 3.2e5
-"""Edge of the ferrite cube [m], and its magnetization along z [A/m]."""
-PLATE = (0.04, 0.04, 0.005)
-"""Sides of the plate [m]."""
-GAPS = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01)
-"""Gaps between plate and magnet [m]."""
+MAGNET, MAGNETIZATION = 0.02, 3.2e5  # edge of the ferrite cube [m], and its magnetization along z [A/m]
+PLATE = (0.04, 0.04, 0.005)  # sides of the plate [m]
+GAPS = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01)  # gaps between plate and magnet [m]
 
 
 def force(gap: float, aside: float = 0.0, rectangles: int = 16) -> tuple[np.ndarray, np.ndarray]:
@@ -95,7 +92,7 @@ def main() -> None:
         change = np.abs(fine - coarse).max().round(4)
         print(gap, aside, "N", fine.round(4), "A·m²", moment.round(4), "change", change, flush=True)
         pull, magnetized, reaction = model_forces(gap, aside)
-        errors = [np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in ((pull, fine), (magnetized, moment))]
+        errors = [relative(pull, fine), relative(magnetized, moment)]
         rest = np.linalg.norm(pull + reaction) / np.linalg.norm(pull)
         print(f"  model: force {100 * errors[0]:.2f} %, moment {100 * errors[1]:.2f} %; sum of forces {rest:.0e}")
 

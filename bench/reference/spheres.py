@@ -17,6 +17,7 @@ References: Jackson, Classical Electrodynamics, 3rd ed., sections 3.6 and 4.1; S
 and translation of regular and irregular solid spherical harmonics"; Jones 1995, Electromechanics of Particles, ch. 6.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -32,30 +33,23 @@ from bench.reference.oracle import MU0
 class Solution:
     """Balls in equilibrium.
 
-    Attributes:
-        moments: Moments [A·m²], shape [n, 3].
-        forces: Forces [N], shape [n, 3].
-        multipoles: Coefficients of the real irregular harmonics around each ball [A m^(l+1)], l = 1..L, m = −l..l,
-            sines for m < 0, cosines for m > 0, shape [n, L (L + 2)]; their potential is ψ.
-        energy: Free energy U = −½ μ0 Σ m·H0 [J]; the forces are −∂U/∂x.
-        truncation: Relative change of the forces against two thirds of the order: an upper bound of their error.
-        order: Order L of the expansions.
+    ``multipoles`` are the coefficients of the real irregular harmonics around each ball [A m^(l+1)], l = 1..L,
+    m = −l..l, sines for m < 0, cosines for m > 0; their potential is ψ.
     """
 
-    moments: np.ndarray
-    forces: np.ndarray
-    multipoles: np.ndarray
-    energy: float
-    truncation: float
-    order: int
+    moments: np.ndarray  # [A·m²], shape [n, 3]
+    forces: np.ndarray  # [N], shape [n, 3]
+    multipoles: np.ndarray  # shape [n, L (L + 2)]
+    energy: float  # free energy U = −½ μ0 Σ m·H0 [J]; the forces are −∂U/∂x
+    truncation: float  # relative change of the forces against two thirds of the order: an upper bound of their error
+    order: int  # order L of the expansions
 
 
 def log_polarizabilities(order: int, radius: float, permeability: float) -> np.ndarray:
     """Logarithms of a ball's multipole polarizabilities p_l [m^(2l+1)], l = 1..order; μr > 1, may be infinite."""
-    degree = np.arange(1, order + 1)
-    response = (
-        1.0 if math.isinf(permeability) else degree * (permeability - 1.0) / (degree * (permeability + 1.0) + 1.0)
-    )
+    degree, response = np.arange(1, order + 1), 1.0
+    if not math.isinf(permeability):
+        response = degree * (permeability - 1.0) / (degree * (permeability + 1.0) + 1.0)
     return (2.0 * degree + 1.0) * np.log(radius) + np.log(response)
 
 
@@ -68,35 +62,22 @@ def sufficient_order(distance: float, radius_i: float, radius_j: float, toleranc
     return max(6, math.ceil(-0.5 * math.log(tolerance) / xi) + 4)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Two balls: on their axis the orders m decouple
-# ---------------------------------------------------------------------------------------------------------------------
+# ---------- Two balls: on their axis the orders m decouple ----------
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two balls in fields that are uniform over each ball: H_i = Σ_j R_ij m_j, along the axis and across it.
+    """Two balls in fields that are uniform over each ball: H_i = Σ_j R_ij m_j, along the axis and across it."""
 
-    Attributes:
-        resistance: R [1/m³], shape [2, 2, 2]: along ([0]) and across ([1]), ball, ball.
-        slope: ∂R/∂d [1/m⁴] at given moments, same shape.
-        order: Order L of the expansions.
-    """
-
-    resistance: np.ndarray
-    slope: np.ndarray
-    order: int
+    resistance: np.ndarray  # R [1/m³], shape [2, 2, 2]: along ([0]) and across ([1]), ball, ball
+    slope: np.ndarray  # ∂R/∂d [1/m⁴] at given moments, same shape
+    order: int  # order L of the expansions
 
 
 def pair(distance, radii, permeabilities, *, order=None, tolerance=1e-10) -> Pair:
-    """Solve two balls.
+    """Solve two balls of given ``distance`` of the centers [m], radii [m] and relative permeabilities μr > 1 (maybe ∞).
 
-    Args:
-        distance: Distance d of the centers [m].
-        radii: The two radii [m].
-        permeabilities: The two relative permeabilities μr > 1, may be infinite.
-        order: Order of the expansions; None chooses it by ``tolerance``.
-        tolerance: Target relative truncation error.
+    None chooses the order of the expansions by ``tolerance``, the target of the relative truncation error.
     """
     unit = math.sqrt(radii[0] * radii[1])
     d, a, b = distance / unit, radii[0] / unit, radii[1] / unit
@@ -122,9 +103,7 @@ def pair(distance, radii, permeabilities, *, order=None, tolerance=1e-10) -> Pai
     return Pair(resistance, slope, order)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Any number of balls
-# ---------------------------------------------------------------------------------------------------------------------
+# ---------- Any number of balls ----------
 
 
 def spheres(positions, radii, permeability, field, **settings) -> Solution:
@@ -152,10 +131,9 @@ def spheres_in_fields(positions, radii, cases, *, order=None, tolerance=1e-4, es
     mu = np.array([np.broadcast_to(np.asarray(permeability, float), n) for permeability, _ in cases])
     fields = np.array([field for _, field in cases], float)
     if order is None:
-        order = max(
-            [sufficient_order(math.dist(x[i], x[j]), radii[i], radii[j], tolerance) for i in range(n) for j in range(i)]
-            or [1]
-        )
+        pairs = itertools.combinations(range(n), 2)
+        orders = [sufficient_order(math.dist(x[i], x[j]), radii[i], radii[j], tolerance) for i, j in pairs]
+        order = max(orders, default=1)
     a, forces = _solve(x, radii, mu, fields, order)
     truncation = np.full(len(cases), math.nan)
     if estimate and order > 1:
@@ -164,9 +142,8 @@ def spheres_in_fields(positions, radii, cases, *, order=None, tolerance=1e-4, es
         truncation = np.linalg.norm(coarse - forces, axis=(1, 2)) / np.maximum(size, np.finfo(float).tiny)
     moments = 4.0 * np.pi * a[:, :, [2, 0, 1]]
     energies = -0.5 * MU0 * np.einsum("kni,ki->k", moments, fields)
-    return [
-        Solution(*values, order) for values in zip(moments, forces, a, map(float, energies), truncation, strict=True)
-    ]
+    rows = zip(moments, forces, a, map(float, energies), truncation, strict=True)
+    return [Solution(*row, order) for row in rows]
 
 
 def _solve(x, radii, mu, fields, order):
@@ -266,13 +243,8 @@ class _Degrees:
         own = np.where(self.m > 0, sign / math.sqrt(2.0), np.where(self.m < 0, 1j / math.sqrt(2.0), 1.0))
         other = np.where(self.m > 0, 1.0 / math.sqrt(2.0), -1j * sign / math.sqrt(2.0))
         paired = self.m != 0
-        self.real = csr_array(
-            (
-                np.concatenate([own, other[paired]]),
-                (np.concatenate([index, mirror[paired]]), np.concatenate([index, index[paired]])),
-            ),
-            shape=(size, size),
-        )
+        places = np.concatenate([index, mirror[paired]]), np.concatenate([index, index[paired]])
+        self.real = csr_array((np.concatenate([own, other[paired]]), places), shape=(size, size))
 
     def translation(self, t, ladder=((0, 0, 1.0),)):
         """Matrix T from irregular real harmonics at a source to regular ones at a target, t = x_target − x_source.

@@ -16,15 +16,13 @@ on a half of their surface: w is odd along H0 and even across it.
 """
 
 import numpy as np
+from scipy.special import ellipe, ellipkm1
 
-CYLINDER_LENGTHS = (1.0, 5.0, 10.0)
-"""Lengths over diameters that tests compare."""
+CYLINDER_LENGTHS = (1.0, 5.0, 10.0)  # lengths over diameters that tests compare
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Bodies bounded by rectangles
-# ---------------------------------------------------------------------------------------------------------------------
+# ---------- Bodies bounded by rectangles ----------
 
 
 def box_moments(sides, susceptibilities, rectangles=(10, 15)) -> np.ndarray:
@@ -35,10 +33,8 @@ def box_moments(sides, susceptibilities, rectangles=(10, 15)) -> np.ndarray:
 def permeable_moments(faces, volume: float, rectangles: int = 12) -> np.ndarray:
     """Moments over V H0 of a body of infinite susceptibility that is bounded by rectangles, shape [3, 3].
 
-    Args:
-        faces: Lower and upper corner of each rectangle, equal along the rectangle's normal, shape [n, 2, 3].
-        volume: Volume of the body.
-        rectangles: Number of parts of each face along each of its sides.
+    ``faces`` are the lower and upper corners of the rectangles, equal along the normals, shape [n, 2, 3]. Each face is
+    divided into ``rectangles`` parts along each of its sides.
     """
     parts = [_divided(face, rectangles) for face in np.asarray(faces, float)]
     lower, upper, axis = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
@@ -55,18 +51,14 @@ def solved_charges(lower, upper, axis, values) -> tuple[np.ndarray, np.ndarray]:
     matrix = np.ones((len(axis) + 1, len(axis) + 1))
     matrix[:-1, :-1] = potentials(center, lower, upper, axis)
     matrix[-1] = np.append(area, 0.0)
-    return center, np.linalg.solve(matrix, np.append(values, np.zeros((1, values.shape[1])), axis=0))[:-1] * area[
-        :, None
-    ]
+    densities = np.linalg.solve(matrix, np.append(values, np.zeros((1, values.shape[1])), axis=0))[:-1]
+    return center, densities * area[:, None]
 
 
 def rectangles_of(edges, axis: int, end: float):
     """Corners of the rectangles of a grid in the plane x[axis] = ``end``, and their axis, shapes [n, 3], [n, 3], [n].
 
-    Args:
-        edges: Coordinates of the grid's lines along each axis.
-        axis: Axis of the normal.
-        end: Coordinate along it.
+    ``edges`` are the coordinates of the grid's lines along each axis.
     """
     a, b = (axis + 1) % 3, (axis + 2) % 3
     i, j = (n.reshape(-1) for n in np.meshgrid(np.arange(len(edges[a]) - 1), np.arange(len(edges[b]) - 1)))
@@ -79,14 +71,13 @@ def potentials(points, lower, upper, axes) -> np.ndarray:
     """(1/4π) ∫ dA/‖x − y‖ over each rectangle at each point, shape [points, rectangles]."""
     result = np.empty((len(points), len(axes)))
     for axis in range(3):
-        own, z, corners = _seen_from(points, lower, upper, axes, axis)
+        chosen, z, corners = _seen_from(points, lower, upper, axes, axis)
         z = np.abs(z)
         total = 0.0
         for sign, x, y in corners:
             r = np.sqrt(x * x + y * y + z * z)
-            part = _times_log(x, y, r) + _times_log(y, x, r) - z * np.arctan2(x * y, z * r)
-            total = total + sign * part
-        result[:, own] = total / (4.0 * np.pi)
+            total = total + sign * (_times_log(x, y, r) + _times_log(y, x, r) - z * np.arctan2(x * y, z * r))
+        result[:, chosen] = total / (4.0 * np.pi)
     return result
 
 
@@ -119,13 +110,13 @@ def _areas(lower, upper, axis) -> np.ndarray:
 
 def _seen_from(points, lower, upper, axes, axis: int):
     """Indices of rectangles normal to ``axis``, their heights over points, and signs and places of their corners."""
-    own, (a, b) = np.flatnonzero(axes == axis), ((axis + 1) % 3, (axis + 2) % 3)
+    chosen, (a, b) = np.flatnonzero(axes == axis), ((axis + 1) % 3, (axis + 2) % 3)
     corners = []
     for i, j in np.ndindex(2, 2):
-        x = (upper if i else lower)[None, own, a] - points[:, None, a]
-        y = (upper if j else lower)[None, own, b] - points[:, None, b]
+        x = (upper if i else lower)[None, chosen, a] - points[:, None, a]
+        y = (upper if j else lower)[None, chosen, b] - points[:, None, b]
         corners.append((1.0 if i == j else -1.0, x, y))
-    return own, lower[None, own, axis] - points[:, None, axis], corners
+    return chosen, lower[None, chosen, axis] - points[:, None, axis], corners
 
 
 def _times_log(a, b, r):
@@ -139,17 +130,15 @@ def _solid_angles(points, lower, upper, axes) -> np.ndarray:
     """Solid angle of each rectangle from each point, positive from below, shape [points, rectangles]."""
     result = np.empty((len(points), len(axes)))
     for axis in range(3):
-        own, z, corners = _seen_from(points, lower, upper, axes, axis)
+        chosen, z, corners = _seen_from(points, lower, upper, axes, axis)
         total, safe = np.zeros_like(z), np.where(z == 0.0, 1.0, z)
         for sign, x, y in corners:
             total += sign * np.arctan(x * y / (safe * np.sqrt(x * x + y * y + z * z)))
-        result[:, own] = np.where(z == 0.0, 0.0, total)
+        result[:, chosen] = np.where(z == 0.0, 0.0, total)
     return result
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Cylinders
-# ---------------------------------------------------------------------------------------------------------------------
+# ---------- Cylinders ----------
 
 
 def cylinder_moments(length: float, susceptibilities, rings=(20, 30)) -> np.ndarray:
@@ -158,10 +147,8 @@ def cylinder_moments(length: float, susceptibilities, rings=(20, 30)) -> np.ndar
 
 
 def _cylinder(length: float, susceptibilities, count: int) -> np.ndarray:
-    """As :func:`cylinder_moments`, with ``count`` rings on half of the side and as many on a cap.
-
-    w is constant around a ring for a field along the axis, and varies as the cosine of the azimuth for one across it.
-    """
+    """Result of :func:`cylinder_moments` for ``count`` rings on half of the side and as many on a cap."""
+    # w is constant around a ring for a field along the axis, and varies as the cosine of the azimuth for one across it
     radius, half = 0.5, 0.5 * length
     at = np.sin(0.5 * np.pi * np.linspace(0.0, 1.0, count + 1))
     side, cap = np.stack([np.full(count + 1, radius), half * at]), np.stack([radius * at, np.full(count + 1, half)])
@@ -206,7 +193,7 @@ def _ring_kernel(x, y, normal, mode: int) -> np.ndarray:
     far2 = (rho + other) ** 2 + height**2
     rest = ((rho - other) ** 2 + height**2) / far2  # 1 − k²
     k2 = np.maximum(4.0 * rho * other / far2, np.finfo(float).tiny)
-    first, second = _elliptic(rest)
+    first, second = ellipkm1(rest), ellipe(1.0 - rest)
     d_first, d_second = (second / rest - first) / (2.0 * k2), (second - first) / (2.0 * k2)
     g, dg = 4.0 * first, 4.0 * d_first
     if mode == 1:
@@ -219,21 +206,6 @@ def _ring_kernel(x, y, normal, mode: int) -> np.ndarray:
     ):
         total = total - n * (dg * d_k2 - 0.5 * g * d_far2 / far2) / np.sqrt(far2)
     return total
-
-
-def _elliptic(rest) -> tuple[np.ndarray, np.ndarray]:
-    """K and E of 1 − k² by the arithmetic-geometric mean (Abramowitz and Stegun 17.6)."""
-    a, b = np.ones_like(rest), np.sqrt(rest)
-    total, power = 0.5 * (1.0 - rest), 0.5
-    for _ in range(12):
-        a, b, c = 0.5 * (a + b), np.sqrt(a * b), 0.5 * (a - b)
-        power *= 2.0
-        total = total + power * c * c
-    first = 0.5 * np.pi / a
-    return first, first * (1.0 - total)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
 
 
 def _extrapolated(moments, counts) -> np.ndarray:

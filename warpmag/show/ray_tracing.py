@@ -248,9 +248,7 @@ def _looking_at_bodies(model: newton.Model, field: float) -> wp.transform:
     return wp.transform(wp.vec3(*place), wp.quat_from_matrix(wp.mat33(*axes.ravel().tolist())))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Light and color
-# ---------------------------------------------------------------------------------------------------------------------
+# ---------- Light and color ----------
 
 
 def _shade(scattered: np.ndarray, normals: np.ndarray, rays: np.ndarray, shapes, albedo, metal, up) -> np.ndarray:

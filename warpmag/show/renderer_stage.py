@@ -110,8 +110,6 @@ class RendererStage:
         self._instances = [shape for shape in self.shapes if shape.drawn and shape.row >= 0 and instanced[shape.row]]
         self._root = self._make_root()
 
-    # ---------------------------------------------------------------------------------------------------------------
-
     def _make_root(self) -> Sdf.Path:
         """Remove prims that are drawn as instances, or not at all; return the path of a prim for new ones."""
         stage, layer = self._stage, self._stage.GetRootLayer()
@@ -172,8 +170,6 @@ class RendererStage:
             if name in spec.properties:
                 spec.RemoveProperty(spec.properties[name])
         author_mesh(UsdGeom.Mesh.Define(self._stage, shape.path), points, faces)
-
-    # ---------------------------------------------------------------------------------------------------------------
 
     def shapes_of_magnets(self) -> list[list[DrawnShape]]:
         """Return the visible shapes of each magnet of the recording, or all shapes if none is visible.
@@ -302,8 +298,6 @@ class RendererStage:
         author_surface(material, color=color, roughness=0.4)
         UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
         UsdGeom.Gprim(prim).CreateDisplayColorAttr(Vt.Vec3fArray([Gf.Vec3f(*color)]))
-
-    # ---------------------------------------------------------------------------------------------------------------
 
     def save(self, output: str | os.PathLike, *, materialx: bool = False) -> None:
         """Write the stage to a ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file, or as a web page, ``.html``.

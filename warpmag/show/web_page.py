@@ -101,9 +101,6 @@ def page_of(stage: Usd.Stage, codes: np.ndarray, title: str) -> str:
     return page.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>", 1)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-
-
 def _instances(stage: Usd.Stage, codes: np.ndarray) -> Iterator[_Batch]:
     """Return the instances of PointInstancers, one batch per shape; colors may change over time."""
     for prim in stage.Traverse():
@@ -169,9 +166,6 @@ def _values(attribute: Usd.Attribute, codes: np.ndarray, array, default: np.ndar
         return default[None]
     many = codes.tolist() if attribute.ValueMightBeTimeVarying() else [codes[0]]
     return np.stack([np.array(array(attribute.Get(code))) for code in many])
-
-
-# ---------------------------------------------------------------------------------------------------------------------
 
 
 def _box(batches: list[_Batch]) -> np.ndarray:
