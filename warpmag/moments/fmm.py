@@ -60,8 +60,8 @@ def expansion_tables(degree: int) -> ExpansionTables:
     """Return the coefficient tables of the harmonics up to a degree."""
     n, m = harmonics.degrees(degree).astype(float), np.abs(harmonics.orders(degree)).astype(float)
     root = np.sqrt(np.maximum((n + m) * (n - m), 1.0))
-    along = np.where(m > 1.0, np.sqrt(np.maximum(2.0 * m - 1.0, 0.0) / np.maximum(2.0 * m, 1.0)), 1.0)
-    growth = np.where(n > m, (2.0 * n - 1.0) / root, along)
+    sectoral = np.where(m > 1.0, np.sqrt(np.maximum(2.0 * m - 1.0, 0.0) / np.maximum(2.0 * m, 1.0)), 1.0)
+    growth = np.where(n > m, (2.0 * n - 1.0) / root, sectoral)
     decay = np.sqrt(np.maximum((n + m - 1.0) * (n - m - 1.0), 0.0)) / root
     return ExpansionTables(
         degree=degree,

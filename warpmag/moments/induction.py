@@ -244,13 +244,14 @@ def _read_balls(context: CallContext, positions, radii, external_field, permanen
     radii = host_scalars("radii", radii, n)
     if not (radii > 0.0).all():
         raise InputError(f"radii: must be positive, got {radii.min():g}")
-    field = context.vectors("external_field", (0.0, 0.0, 0.0) if external_field is None else external_field, n)
+    applied_field = context.vectors("external_field", (0.0, 0.0, 0.0) if external_field is None else external_field, n)
     if permanent is None:
         permanent = np.zeros((0, 3)), np.zeros((0, 3))
     if not isinstance(permanent, (tuple, list)) or len(permanent) != 2:
         raise InputError(f"permanent: must be (positions, moments), got {short_repr(permanent)}")
-    places = context.vectors("permanent: positions", permanent[0], farthest=farthest)
-    return _Balls(x, radii, field, places, context.vectors("permanent: moments", permanent[1], places.shape[0]))
+    dipoles = context.vectors("permanent: positions", permanent[0], farthest=farthest)
+    moments = context.vectors("permanent: moments", permanent[1], dipoles.shape[0])
+    return _Balls(x, radii, applied_field, dipoles, moments)
 
 
 def _read_material(count: int, saturation, susceptibility, curve) -> MomentMaterial:

@@ -65,10 +65,10 @@ class PairSums:
             self.targets = packed(shape.target_count, shape.target_radius)
         count = self.targets.count
         self.base, self.out = (wp.zeros(count, dtype=vec3_type(shape.dtype), device=shape.device) for _ in range(2))
-        self.torques = turned = None
+        self.torques = rotatable = None
         if shape.quantity == Quantity.WRENCH:
-            self.torques, turned = wp.zeros_like(self.out), wp.ones(count, dtype=int, device=shape.device)
-        self._turned, self._shape, self._all_pairs = turned, shape, None
+            self.torques, rotatable = wp.zeros_like(self.out), wp.ones(count, dtype=int, device=shape.device)
+        self._rotatable, self._shape, self._all_pairs = rotatable, shape, None
 
     def launch(self, fmm_rtol: float | None = None) -> None:
         """Launch the sums at the targets, by multipoles with the relative error ``fmm_rtol``; None means all pairs."""
@@ -88,7 +88,7 @@ class PairSums:
         shape, count = self._shape, self.targets.count
         return PairEvaluation(
             shape.quantity, [(0, count, 0, shape.count)], self.targets, self.moments, self.base, self.out,
-            with_torque=self._turned, torques=self.torques, form=REFERENCE if shape.reference else None,
+            with_torque=self._rotatable, torques=self.torques, form=REFERENCE if shape.reference else None,
             smoothing=shape.smoothing, sums=sums, ranks=current_ranks(),
         )  # fmt: skip
 

@@ -152,14 +152,14 @@ class MomentSystem:
         self.material, susceptibility = material.parameters(layout.permanent, self.dtype, self.device)
         layout = self._make_bias(layout)
         self._make_sources(layout, sources, solids)
-        turned = ~layout.aligned | settings.single_torque
+        rotatable = ~layout.aligned | settings.single_torque
         self._fast = fast_sums_for(settings.method, self._packed, layout, body_extent, float(settings.rtol))
         self.is_fast = isinstance(self._fast, SystemSums)
         self._make_field(layout, near)
         self._make_cells(layout, couplings, whole=theta)
-        self._make_wrench(layout, turned)
+        self._make_wrench(layout, rotatable)
         self._permanent_fields = None
-        self._near = self._make_near_contacts(layout, turned, susceptibility) if near else None
+        self._near = self._make_near_contacts(layout, rotatable, susceptibility) if near else None
         limits = float(settings.rtol), int(settings.max_evaluations)
         solve_state.bind(self._induction, self._packed, self.material, self.moments, *limits)
         responses = self._make_responses(layout, couplings) if theta else None
@@ -240,10 +240,10 @@ class MomentSystem:
         ]
         return BodyResponses(self._induction, bodies, self._cells) if bodies else None
 
-    def _make_wrench(self, layout: MomentLayout, turned):
-        """Prepare forces on movable moments for each force law, and torques of the moments that ``turned`` marks."""
-        self._turned = wp.array(turned.astype(np.int32), dtype=wp.int32, device=self.device)
-        segments = [np.reshape(layout.runs(layout.movable & rows), (-1, 4)) for rows in (~turned, turned)]
+    def _make_wrench(self, layout: MomentLayout, rotatable):
+        """Prepare forces on movable moments for each force law, and torques of the moments that ``rotatable`` marks."""
+        self._rotatable = wp.array(rotatable.astype(np.int32), dtype=wp.int32, device=self.device)
+        segments = [np.reshape(layout.runs(layout.movable & rows), (-1, 4)) for rows in (~rotatable, rotatable)]
         all_segments = np.concatenate(segments)
         pairs = pair_count(all_segments)
 
@@ -255,7 +255,7 @@ class MomentSystem:
             return [
                 PairEvaluation(
                     quantity, rows, self._packed, self._packed, self._acting_field, self.forces, effective=effective,
-                    with_torque=self._turned, torques=self.torques, sums=self._fast.sums_of(quantity, pairs),
+                    with_torque=self._rotatable, torques=self.torques, sums=self._fast.sums_of(quantity, pairs),
                     ranks=self._ranks,
                 )
                 for quantity, rows in parts
@@ -267,14 +267,14 @@ class MomentSystem:
             "zeeman": evaluations(Quantity.FORCE, self._effective),
         }
 
-    def _make_near_contacts(self, layout: MomentLayout, turned, susceptibility):
+    def _make_near_contacts(self, layout: MomentLayout, rotatable, susceptibility):
         magnets = layout.permanent | (self.material.curve.numpy() == LINEAR)
         for solid in () if self.sources is None else self.sources.solids:  # closed forms replace their moments
             magnets[solid.first : solid.first + solid.count] = solid.response > 0.0
         return near_pairs.allocate(
             self._packed, layout.worlds, layout.balls, susceptibility, self.material,
             ranges=self.world_ranges, magnets=magnets, single=layout.single, field=self._inducible_field,
-            movable=layout.movable, rotatable=turned, forces=self.forces, torques=self.torques,
+            movable=layout.movable, rotatable=rotatable, forces=self.forces, torques=self.torques,
             expansion=None if self.source_interaction is None else self.source_interaction.expansion,
         )  # fmt: skip
 
@@ -317,8 +317,8 @@ class MomentSystem:
 
         Computed forces act for at most ``step`` [s].
         """
-        turned, ranges = self._turned.numpy() == 0, [(first, last) for first, _, last in self.world_ranges]
-        self.eddy = EddyCurrents(self._packed, ranges, conductivity, turned, self.material, step)
+        aligned, ranges = self._rotatable.numpy() == 0, [(first, last) for first, _, last in self.world_ranges]
+        self.eddy = EddyCurrents(self._packed, ranges, conductivity, aligned, self.material, step)
         if self.source_interaction is not None:
             self.source_interaction.follow(self.eddy.motion)
 

@@ -83,11 +83,11 @@ class CellGrid:
         points = part.test_points(np.maximum(np.ceil((part.upper - part.lower) / pitch).astype(int), _MOST_SPLITS))
         whole, free = _inside(part, others, points)
         points = points[free]
-        places = (points - self.lower) / self.sides
-        index = np.clip(places.astype(int), 0, self.counts - 1)
+        coordinates = (points - self.lower) / self.sides
+        index = np.clip(coordinates.astype(int), 0, self.counts - 1)
         index, cell = np.unique(index, axis=0, return_inverse=True)
         cell = cell.reshape(-1)
-        split = np.clip(((places - index[cell]) * self.splits).astype(int), 0, self.splits - 1)
+        split = np.clip(((coordinates - index[cell]) * self.splits).astype(int), 0, self.splits - 1)
         subcell = np.ravel_multi_index(tuple(split.T), tuple(self.splits))
         size = int(self.splits.prod())
         hits = np.bincount(cell * size + subcell, minlength=len(index) * size).reshape(-1, *self.splits)
@@ -114,12 +114,12 @@ def cells_over(parts: Sequence[Solid], earlier: Sequence[Solid], spacing: float,
     flattest = np.inf if len(parts) == 1 else _FLATTEST if across > 1 else 1.0
     fit = np.maximum(np.rint(thin / spacing), np.minimum(across, flattest * thin / spacing))
     sides = thin / np.where(fit < 1.0, fit, np.rint(fit))
-    before = np.ceil((face - lower) / sides - 1e-6)
-    counts = (before + np.ceil((upper - face) / sides - 1e-6)).astype(int)
+    cells_before = np.ceil((face - lower) / sides - 1e-6)
+    counts = (cells_before + np.ceil((upper - face) / sides - 1e-6)).astype(int)
     splits = np.maximum(np.ceil(_FINE_POINTS * sides / thin - 1e-6).astype(int), 1)
     splits = np.where(splits > 4, -(-splits // 8) * 8, 4)  # demagnetizing tensors use 8 or 4 subcells
     splits = splits if len(parts) == 1 else np.minimum(splits, _MOST_SPLITS)
-    lower = face - before * sides
+    lower = face - cells_before * sides
     return CellGrid(solids, len(earlier), lower, sides, counts, splits, largest.position, largest.rotation)
 
 

@@ -68,7 +68,7 @@ def winding_number(points: np.ndarray, triangles: np.ndarray) -> Callable[[np.nd
     low = np.minimum(triangles, np.roll(triangles, -1, axis=1))
     high = np.maximum(triangles, np.roll(triangles, -1, axis=1))
     forward = triangles == low
-    origin, along = points[low, :2], points[high, :2] - points[low, :2]
+    origin, direction = points[low, :2], points[high, :2] - points[low, :2]
 
     def winding(p: np.ndarray) -> np.ndarray:
         xy = np.clip(((p[:, :2] - lower) / width).astype(int), 0, columns - 1)
@@ -82,8 +82,8 @@ def winding_number(points: np.ndarray, triangles: np.ndarray) -> Callable[[np.nd
             rows = np.arange(begin, stop)
             point = np.repeat(rows, sizes[column[rows]])
             t = entries[starts[column[point]] + _counters(sizes[column[rows]])]
-            away = p[point, None, :2] - origin[t]
-            side = along[t, :, 0] * away[:, :, 1] - along[t, :, 1] * away[:, :, 0]
+            offset = p[point, None, :2] - origin[t]
+            side = direction[t, :, 0] * offset[:, :, 1] - direction[t, :, 1] * offset[:, :, 0]
             left = (side >= 0.0) == forward[t]
             up, down = left.all(axis=1), ~left.any(axis=1)
             crossed = np.flatnonzero(up | down)

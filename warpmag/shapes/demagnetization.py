@@ -92,12 +92,12 @@ class Coupling:
         images = np.empty((0, basis.shape[1]))
         while len(images) < min(_LANCZOS_STEPS, basis.shape[1]):
             images = np.append(images, [apply(basis[-1])], axis=0)
-            rest = images[-1] - (basis @ images[-1]) @ basis
-            rest -= (basis @ rest) @ basis
-            size = np.linalg.norm(rest)
+            residual = images[-1] - (basis @ images[-1]) @ basis
+            residual -= (basis @ residual) @ basis
+            size = np.linalg.norm(residual)
             if size < 1e-9 * np.linalg.norm(images[0]):
                 break
-            basis = np.append(basis, [rest / size], axis=0)
+            basis = np.append(basis, [residual / size], axis=0)
         return max(0.0, float(np.linalg.eigvalsh(basis[: len(images)] @ images.T)[-1]))
 
     @cached_property
@@ -122,8 +122,8 @@ def cuboid_tensors(offsets: np.ndarray, sides: np.ndarray) -> np.ndarray:
     ``offsets`` are the vectors between their centers in ``sides``, whole numbers, shape [n, 3].
     """
     offsets = np.asarray(offsets).astype(int)
-    signs, places = np.where(offsets < 0, -1.0, 1.0), np.abs(offsets)
-    total = _tensor_table(places.max(axis=0, initial=0) + 1, sides)[tuple(places.T)]
+    signs, distances = np.where(offsets < 0, -1.0, 1.0), np.abs(offsets)
+    total = _tensor_table(distances.max(axis=0, initial=0) + 1, sides)[tuple(distances.T)]
     total[:, 3:] *= signs[:, [0, 0, 1]] * signs[:, [1, 2, 2]]
     return total
 
@@ -220,9 +220,9 @@ def _part_tensors(part: Pieces, lattice: Lattice, reach: float) -> tuple[np.ndar
     sums /= np.sqrt(volume[i] * volume[j])[:, None]
     own, spreads = i == j, _second_moments(part, first, volume)
     sums[own] += _far_corrections(local, part.sides.prod() * volume, spreads, reach)[i[own]]
-    both = i != j
-    pairs = np.concatenate([np.stack([i, j]), np.stack([j[both], i[both]])], axis=1) + first
-    return pairs, _rotated(np.concatenate([sums, sums[both]]), part.rotation)
+    distinct = i != j
+    pairs = np.concatenate([np.stack([i, j]), np.stack([j[distinct], i[distinct]])], axis=1) + first
+    return pairs, _rotated(np.concatenate([sums, sums[distinct]]), part.rotation)
 
 
 def _second_moments(part: Pieces, first: int, volume: np.ndarray) -> np.ndarray:
@@ -285,8 +285,8 @@ def _near_pairs(points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarra
     pairs = []
     step = max(1, _BATCH // max(1, 3 * len(points)))
     for begin in range(0, len(points), step):
-        apart = points[begin : begin + step, None] - points
-        i, j = np.nonzero((apart**2).sum(axis=2) <= reach * reach * (1.0 + 1e-9))
+        separation = points[begin : begin + step, None] - points
+        i, j = np.nonzero((separation**2).sum(axis=2) <= reach * reach * (1.0 + 1e-9))
         pairs.append(np.stack([i + begin, j]))
     i, j = np.concatenate(pairs, axis=1)
     return i[i <= j], j[i <= j]
@@ -294,28 +294,30 @@ def _near_pairs(points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarra
 
 def _piece_tensors(part: Pieces, p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return ∫∫ of the demagnetizing kernel over pairs of pieces, divided by a cell's volume, shape [pairs, 6]."""
-    apart = part.index[p] - part.index[q]
+    separation = part.index[p] - part.index[q]
     full = part.filled.min(axis=(1, 2, 3)) == 1.0
-    whole, touching = full[p] & full[q], (np.abs(apart) <= 1).all(axis=1)
+    whole, touching = full[p] & full[q], (np.abs(separation) <= 1).all(axis=1)
     near, far = np.flatnonzero(~whole & touching), np.flatnonzero(~whole & ~touching)
     result = np.empty((len(p), 6))
-    offsets, inverse = np.unique(apart[whole], axis=0, return_inverse=True)
+    offsets, inverse = np.unique(separation[whole], axis=0, return_inverse=True)
     result[whole] = cuboid_tensors(offsets, part.sides)[inverse.reshape(-1)]
     if len(near):
         filled = _binary(_coarsened(part.filled, _SUBCELLS))
-        result[near] = _cut_tensors(part.sides, filled, p[near], q[near], apart[near])
+        result[near] = _cut_tensors(part.sides, filled, p[near], q[near], separation[near])
     if len(far):
-        result[far] = _cut_tensors(part.sides, _coarsened(part.filled, _DISTANT_SUBCELLS), p[far], q[far], apart[far])
+        result[far] = _cut_tensors(
+            part.sides, _coarsened(part.filled, _DISTANT_SUBCELLS), p[far], q[far], separation[far]
+        )
     return result
 
 
-def _cut_tensors(sides: np.ndarray, filled: np.ndarray, p, q, apart) -> np.ndarray:
+def _cut_tensors(sides: np.ndarray, filled: np.ndarray, p, q, separation) -> np.ndarray:
     """Return :func:`_piece_tensors` of pieces that the surface cuts, from the tensors of their subcells.
 
     The sum over pairs of subcells is a sum of tensors times the correlation of the filled shares, by Fourier transform.
     """
     split = np.array(filled.shape[1:])
-    reach = (np.abs(apart).max(axis=0) + 1) * split
+    reach = (np.abs(separation).max(axis=0) + 1) * split
     table = _tensor_table(reach, sides / split)
     period, size = tuple(2 * split), len(filled)
     filled = np.fft.rfftn(filled, period, axes=(1, 2, 3))
@@ -325,7 +327,7 @@ def _cut_tensors(sides: np.ndarray, filled: np.ndarray, p, q, apart) -> np.ndarr
     between = (grid(2 * split) + split) % (2 * split) - split  # offset between subcells, in subcells
     valid = np.all(between > -split, axis=1)
     result = np.empty((len(p), 6))
-    offsets, inverse = np.unique(apart, axis=0, return_inverse=True)
+    offsets, inverse = np.unique(separation, axis=0, return_inverse=True)
     order = np.argsort(inverse.reshape(-1), kind="stable")
     ends = np.append(0, np.cumsum(np.bincount(inverse.reshape(-1))))
     for k, offset in enumerate(offsets):  # in cells

@@ -246,8 +246,8 @@ def _fill(parts: Sequence[Solid], spacing: float, across: int, together: bool) -
 
 def _concatenated(pieces: list[Pieces]) -> Pieces:
     """Return the pieces of several shapes in one grid as one record."""
-    before = np.cumsum([0, *(len(p.index) for p in pieces)])
-    pieces = [replace(p, piece=p.piece + first) for p, first in zip(pieces, before, strict=False)]
+    firsts = np.cumsum([0, *(len(p.index) for p in pieces)])
+    pieces = [replace(p, piece=p.piece + first) for p, first in zip(pieces, firsts, strict=False)]
     columns = ("index", "filled", "piece", "moment", "share")
     return replace(pieces[0], **{name: np.concatenate([getattr(p, name) for p in pieces]) for name in columns})
 

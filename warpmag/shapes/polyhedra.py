@@ -69,9 +69,9 @@ class Polyhedron:
         longest, points = rows[:, 6].max(), []
         for row in rows:
             nodes, weights = _gauss(max(_LEAST_POINTS, int(np.ceil(_EDGE_POINTS * row[6] / longest - 1e-6))))
-            places = row[:3] + row[6] * nodes[:, None] * row[3:6]
+            positions = row[:3] + row[6] * nodes[:, None] * row[3:6]
             fixed = np.broadcast_to(np.delete(row, [0, 1, 2, 6]), (len(nodes), 15))
-            points.append(np.concatenate([places, fixed, row[6] * weights[:, None]], axis=1))
+            points.append(np.concatenate([positions, fixed, row[6] * weights[:, None]], axis=1))
         return np.concatenate(points)
 
     def face_points(self, *, fine: bool = False) -> np.ndarray:
@@ -79,8 +79,10 @@ class Polyhedron:
         across = _FINE_FACE_POINTS if fine else _FACE_POINTS
         longest, points = self.edge_rows()[:, 6].max(), []
         for face, normal in zip(self.faces, self.normals, strict=True):
-            places, weights = _gauss_points_on_face(self.corners[list(face)], longest, across)
-            points.append(np.concatenate([places, np.broadcast_to(normal, places.shape), weights[:, None]], axis=1))
+            positions, weights = _gauss_points_on_face(self.corners[list(face)], longest, across)
+            points.append(
+                np.concatenate([positions, np.broadcast_to(normal, positions.shape), weights[:, None]], axis=1)
+            )
         return np.concatenate(points)
 
 
@@ -91,7 +93,7 @@ class Moments:
     Lattice cells that are not cubes, or that a surface cuts, have an error of 1e-2 at any distance.
     """
 
-    places: np.ndarray  # [m], shape [n, 3]
+    positions: np.ndarray  # [m], shape [n, 3]
     volumes: np.ndarray  # [m³], shape [n]
     depths: np.ndarray  # below the surface of the body [m], shape [n]
     reach: float  # smallest distance from the surface at which the moments replace the body [m]
@@ -116,9 +118,9 @@ def box_moments(half_extents) -> Moments:
     half = np.asarray(half_extents, float)
     lines, distance = _planned(half.min(), lambda distance: [_line(h, distance) for h in half])
     (x, wx), (y, wy), (z, wz) = (_along(h, *line) for h, line in zip(half, lines, strict=True))
-    places = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+    positions = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
     shares = (wx[:, None, None] * wy[:, None] * wz).ravel()
-    return Moments(places, 8.0 * half.prod() * shares, (half - np.abs(places)).min(axis=1), distance)
+    return Moments(positions, 8.0 * half.prod() * shares, (half - np.abs(positions)).min(axis=1), distance)
 
 
 def cylinder_moments(radius: float, half_height: float) -> Moments:
@@ -132,10 +134,10 @@ def cylinder_moments(radius: float, half_height: float) -> Moments:
     (squared, area), (z, height) = _gauss(rings), _along(half_height, *line)
     angle = 2.0 * np.pi / around * np.arange(around)
     r, phi, z = np.meshgrid(radius * np.sqrt(squared), angle, z, indexing="ij")
-    places = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1).reshape(-1, 3)
+    positions = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1).reshape(-1, 3)
     shares = (area[:, None, None] / around * np.ones((around, 1)) * height).ravel()
     depth = np.minimum(radius - r, half_height - np.abs(z)).ravel()
-    return Moments(places, 2.0 * np.pi * radius**2 * half_height * shares, depth, distance)
+    return Moments(positions, 2.0 * np.pi * radius**2 * half_height * shares, depth, distance)
 
 
 def _planned(half: float, plan):
@@ -161,8 +163,8 @@ def _line(half: float, distance: float, panels: int = 0) -> tuple[int, int]:
 def _along(half: float, panels: int, points: int) -> tuple[np.ndarray, np.ndarray]:
     """Return Gauss points on a line from −half to half, and their weights, which sum to 1."""
     nodes, shares = _gauss(points)
-    places = (np.arange(panels)[:, None] + nodes).ravel() / panels
-    return (2.0 * places - 1.0) * half, np.tile(shares / panels, panels)
+    positions = (np.arange(panels)[:, None] + nodes).ravel() / panels
+    return (2.0 * positions - 1.0) * half, np.tile(shares / panels, panels)
 
 
 def _prism(polygon: np.ndarray, half_height: float) -> Polyhedron:
@@ -179,13 +181,13 @@ def _gauss_points_on_face(corners: np.ndarray, longest: float, most: int) -> tup
         across = corners[1] - corners[0], corners[3] - corners[0]
         counts = [max(2, int(np.ceil(most * np.linalg.norm(side) / longest - 1e-6))) for side in across]
         (u, wu), (v, wv) = (_gauss(count) for count in counts)
-        places = corners[0] + u[:, None, None] * across[0] + v[:, None] * across[1]
-        return places.reshape(-1, 3), np.outer(wu, wv).ravel() * np.linalg.norm(np.cross(*across))
+        positions = corners[0] + u[:, None, None] * across[0] + v[:, None] * across[1]
+        return positions.reshape(-1, 3), np.outer(wu, wv).ravel() * np.linalg.norm(np.cross(*across))
     center, following = corners.mean(axis=0), np.roll(corners, -1, axis=0)
     nodes, weights = _gauss(most)
-    places = center + nodes[:, None] * (0.5 * (corners + following) - center)[:, None]
+    positions = center + nodes[:, None] * (0.5 * (corners + following) - center)[:, None]
     areas = np.linalg.norm(np.cross(corners - center, following - center), axis=1)
-    return places.reshape(-1, 3), np.outer(areas, nodes * weights).ravel()
+    return positions.reshape(-1, 3), np.outer(areas, nodes * weights).ravel()
 
 
 def _gauss(count: int) -> tuple[np.ndarray, np.ndarray]:

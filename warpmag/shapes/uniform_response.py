@@ -138,8 +138,8 @@ def potentials(points: np.ndarray, surface: np.ndarray) -> np.ndarray:
 
 def _squared_distances(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Return the squared distances between points, shape [points, others]."""
-    apart = points[:, None] - others  # x² − 2xy + y² would lose the digits of small facets far from the origin
-    return np.einsum("nmk,nmk->nm", apart, apart)
+    separation = points[:, None] - others  # x² − 2xy + y² would lose the digits of small facets far from the origin
+    return np.einsum("nmk,nmk->nm", separation, separation)
 
 
 def _near_potentials(points: np.ndarray, surface: np.ndarray, near: np.ndarray) -> np.ndarray:
@@ -184,17 +184,17 @@ def cell_polarizability(coupling: Coupling, lattice: Lattice) -> np.ndarray:
     apply, root = _cell_operator(coupling, lattice), np.sqrt(lattice.volumes)[:, None, None]
     fields = root * common_fields(coupling.scaled_positions)[:, :, : _field_count(coupling)]
     solution, residual = np.zeros_like(fields), fields
-    search, size = residual, (residual**2).sum(axis=(0, 1))
-    goal = _RESIDUAL**2 * size
+    search, squared_norm = residual, (residual**2).sum(axis=(0, 1))
+    goal = _RESIDUAL**2 * squared_norm
     for _ in range(_MOST_STEPS):
-        unfinished = size > goal
+        unfinished = squared_norm > goal
         if not unfinished.any():
             break
         image = apply(search)
-        step = np.where(unfinished, size / np.where(unfinished, (search * image).sum(axis=(0, 1)), 1.0), 0.0)
+        step = np.where(unfinished, squared_norm / np.where(unfinished, (search * image).sum(axis=(0, 1)), 1.0), 0.0)
         solution, residual = solution + step * search, residual - step * image
-        size, before = (residual**2).sum(axis=(0, 1)), size
-        search = residual + np.where(unfinished, size / before, 0.0) * search
+        squared_norm, previous = (residual**2).sum(axis=(0, 1)), squared_norm
+        search = residual + np.where(unfinished, squared_norm / previous, 0.0) * search
     moments = np.einsum("nkl,nkm->lm", solution, fields + residual)  # second order in the residual
     return 0.5 * (moments + moments.T)
 

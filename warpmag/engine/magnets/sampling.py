@@ -125,7 +125,7 @@ class ShapeSampler:
         for shape, solid, surface in zip(shapes, solids, surfaces, strict=True):
             scale, box = self._scales[shape], self._types[shape] == newton.GeoType.BOX
             moments = polyhedra.box_moments(scale) if box else polyhedra.cylinder_moments(scale[0], scale[1])
-            positions.append(solid.to_body(moments.places))
+            positions.append(solid.to_body(moments.positions))
             volumes.append(moments.volumes)
             radii.append(np.minimum(0.5 * np.cbrt(moments.volumes), moments.depths))
             parts.append(ClosedForm(first, len(moments.volumes), surface, moments.reach))
