@@ -193,10 +193,10 @@ class _Balls:
     """n inducible balls in an applied field, and k permanent point dipoles."""
 
     positions: wp.array  # centers [m], shape [n]
-    radii: np.ndarray  # [m], shape [n]
+    radii: np.ndarray  # radii [m], shape [n]
     external_field: wp.array  # applied field [A/m], shape [n]
-    permanent_positions: wp.array  # of the permanent dipoles [m], shape [k]
-    permanent_moments: wp.array  # [A·m²], shape [k]
+    permanent_positions: wp.array  # positions of the dipoles [m], shape [k]
+    permanent_moments: wp.array  # moments of the dipoles [A·m²], shape [k]
 
     @property
     def count(self) -> int:

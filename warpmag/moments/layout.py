@@ -19,13 +19,13 @@ from warpmag.moments.arrays import check_bodies, host_positive, host_radii, host
 class MomentLayout:
     """Geometry, world and body of each moment: NumPy arrays of shape [n]."""
 
-    radii: np.ndarray  # of the moment's ball [m]
+    radii: np.ndarray  # radius of the moment's ball [m]
     worlds: np.ndarray
     permanent: np.ndarray
     bodies: np.ndarray
-    movable: np.ndarray  # the force on the moment is computed
-    single: np.ndarray  # the body has no other moment
-    aligned: np.ndarray  # inducible ball of a single moment, which is parallel to the field, so that its torque is 0
+    movable: np.ndarray  # True if the force on the moment is computed
+    single: np.ndarray  # True if the body has no other moment
+    aligned: np.ndarray  # True for an inducible single ball, parallel to the field, so that its torque is 0
 
     @property
     def balls(self) -> np.ndarray:

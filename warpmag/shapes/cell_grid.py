@@ -35,13 +35,13 @@ class CellGrid:
     """Equal cells over shapes, in the frame of the largest. Along each axis they fit the thinnest shape exactly."""
 
     solids: list[Solid]  # shapes posed in the frame of the grid
-    earlier: int  # number of the first shapes, which have no cells in the grid, but remove overlap
+    earlier: int  # number of shapes without cells that only remove overlap, the first of ``solids``
     lower: np.ndarray  # lower corner [m], shape [3]
     sides: np.ndarray  # sides of a cell [m], shape [3]
     counts: np.ndarray  # cells along each axis, shape [3]
     splits: np.ndarray  # test points across a cell along each axis, shape [3]
     position: np.ndarray  # origin of the grid in the body's frame [m], shape [3]
-    rotation: np.ndarray  # from the frame of the grid to the body's, shape [3, 3]
+    rotation: np.ndarray  # rotation from the frame of the grid to the body's, shape [3, 3]
 
     def filled(self, k: int) -> Filled:
         """Return the part of each cell that shape ``k`` fills."""

@@ -53,9 +53,9 @@ class Coupling:
     start: np.ndarray  # first entry of each moment, and the end, shape [n + 1]
     other: np.ndarray  # moment j of each entry, ascending, shape [entries]
     tensor: np.ndarray  # T_ij [1/m³], xx, yy, zz, xy, xz, yz, shape [entries, 6]
-    common: np.ndarray  # C [1/m³], shape [8, 8]
-    positions: np.ndarray  # of the moments [m], shape [n, 3]
-    radii: np.ndarray  # of the moments' balls [m], shape [n]
+    common: np.ndarray  # matrix C [1/m³], shape [8, 8]
+    positions: np.ndarray  # positions of the moments [m], shape [n, 3]
+    radii: np.ndarray  # radii of the moments' balls [m], shape [n]
 
     @cached_property
     def center(self) -> np.ndarray:

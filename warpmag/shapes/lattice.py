@@ -69,19 +69,19 @@ class Pieces:
     sides: np.ndarray  # sides of a cell [m], shape [3]
     index: np.ndarray  # index of each piece's cell in the grid, shape [p, 3]
     filled: np.ndarray  # filled share of each subcell, shape [p, a, b, c]
-    piece: np.ndarray  # shape [entries]
-    moment: np.ndarray  # shape [entries]
+    piece: np.ndarray  # index of the piece of each entry, shape [entries]
+    moment: np.ndarray  # index of the moment of each entry, shape [entries]
     share: np.ndarray  # share of the piece that belongs to the moment, shape [entries]
     position: np.ndarray  # origin of the grid in the body's frame [m], shape [3]
-    rotation: np.ndarray  # from the frame of the grid to the body's, shape [3, 3]
+    rotation: np.ndarray  # rotation from the frame of the grid to the body's, shape [3, 3]
 
 
 @dataclass(frozen=True)
 class Lattice:
     """Moments that represent one solid body."""
 
-    positions: np.ndarray  # of the moments [m], body frame, shape [n, 3]
-    volumes: np.ndarray  # [m³], shape [n]; their sum is the volume of the body
+    positions: np.ndarray  # positions of the moments [m], body frame, shape [n, 3]
+    volumes: np.ndarray  # volumes [m³], shape [n]; their sum is the volume of the body
     owners: np.ndarray  # index of each moment's shape, non-decreasing, shape [n]
     pieces: tuple[Pieces, ...] = ()  # parts of cells that the moments represent, one entry per grid; empty for a ball
 

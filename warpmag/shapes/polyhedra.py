@@ -95,7 +95,7 @@ class Moments:
 
     positions: np.ndarray  # [m], shape [n, 3]
     volumes: np.ndarray  # [m³], shape [n]
-    depths: np.ndarray  # below the surface of the body [m], shape [n]
+    depths: np.ndarray  # depths below the surface of the body [m], shape [n]
     reach: float  # smallest distance from the surface at which the moments replace the body [m]
 
 

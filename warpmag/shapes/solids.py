@@ -14,15 +14,15 @@ Values = Sequence[float] | np.ndarray
 class Solid:
     """A solid shape, posed in the frame of its body. All values but the pose are in the frame of the shape."""
 
-    name: str  # in error messages
+    name: str  # name in error messages
     lower: np.ndarray  # lower corner of the bounding box [m], shape [3]
     upper: np.ndarray  # upper corner of the bounding box [m], shape [3]
     volume: float  # [m³]
     centroid: np.ndarray  # [m], shape [3]
-    inside: Callable[[np.ndarray], np.ndarray]  # returns True for points inside, of points [m], shape [n, 3]
-    facets: Callable[[int], np.ndarray]  # returns about a count of facets of the surface [m], shape [m, 4, 3]
+    inside: Callable[[np.ndarray], np.ndarray]  # True for each point inside, from points [m], shape [n, 3]
+    facets: Callable[[int], np.ndarray]  # about a given number m of facets of the surface [m], shape [m, 4, 3]
     position: np.ndarray = field(default_factory=lambda: np.zeros(3))  # origin in the body's frame [m], shape [3]
-    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))  # from its frame to the body's, shape [3, 3]
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))  # rotation to the body's frame, shape [3, 3]
 
     def posed(self, position: Values, quaternion: Values = (0.0, 0.0, 0.0, 1.0)) -> "Solid":
         """Return the shape at ``position`` [m], rotated by ``quaternion`` (x, y, z, w), both in the body's frame."""

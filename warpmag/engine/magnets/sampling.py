@@ -37,7 +37,7 @@ class ClosedForm:
     first: int  # first moment of the shape in its magnet
     count: int  # number of moments
     shape: Polyhedron  # surface, in the frame of the body
-    reach: float  # distance up to which the closed form is used [m]
+    reach: float  # largest distance at which the closed form is used [m]
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class BodyLattice:
 
     positions: np.ndarray  # [m], shape [n, 3]
     volumes: np.ndarray  # [m³], shape [n]
-    radii: np.ndarray  # of the balls over which the fields of moments are averaged [m], shape [n]
+    radii: np.ndarray  # radii of the balls that average the fields of moments [m], shape [n]
     counts: np.ndarray  # number of moments of each shape
     coupling: Coupling | None = None  # tensors between inducible cells, minus the pair law of balls
     solids: tuple[ClosedForm, ...] = ()  # closed forms of the near field of a permanent magnet

@@ -14,9 +14,9 @@ class SolverKind:
     """One kind of rigid-body solver."""
 
     make: Callable  # function of a model and the capacity of its contact buffer that returns the solver
-    maximal: bool = False  # maximal coordinates, the poses of bodies, so that joints need no articulation
-    resumable: bool = True  # no hidden state between steps, so that a checkpoint is complete
-    contacts_at_end: bool = False  # contacts at the end of a step, so that kinematic bodies must be posed there
+    maximal: bool = False  # moves poses of bodies, so that joints need no articulation
+    resumable: bool = True  # has no hidden state between steps, so that a checkpoint is complete
+    contacts_at_end: bool = False  # evaluates contacts at the end of a step, and needs kinematic bodies posed there
     warning: str = ""  # known weakness, in one line for the user
 
 

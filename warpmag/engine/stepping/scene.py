@@ -45,13 +45,13 @@ class ImportedScene:
 
     opened: Any  # the open stage, without prims for instances of identical balls
     identical_balls: list[IdenticalBalls]
-    builder: newton.ModelBuilder  # in the world frame and the units of the stage
+    builder: newton.ModelBuilder  # bodies, shapes and joints, in the world frame and the units of the stage
     clock: StageClock
     magnets: StageMagnets
-    bodies: dict[str, int]  # by rigid-body prim
+    bodies: dict[str, int]  # body of each rigid-body prim
     magnet_shapes: dict[str, list[int]]  # shapes of each magnet prim
-    keys: SceneKeys  # from time samples
-    warnings: tuple[str, ...]  # about the stage, one line each
+    keys: SceneKeys  # keys from time samples
+    warnings: tuple[str, ...]  # warnings about the stage, one line each
 
     @cached_property
     def stage(self) -> Any:

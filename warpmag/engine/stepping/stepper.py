@@ -61,7 +61,7 @@ class StepReport:
     error: float  # largest magnetization error of a substep
     evaluations: int  # field evaluations of all substeps
     unconverged: int  # substeps without convergence of the induction
-    seconds: tuple[float, float, float] | None  # of induction, forces, rigid bodies, all attempts; None while compiling
+    seconds: tuple[float, float, float] | None  # times of induction, forces, rigid bodies [s]; None while compiling
 
 
 class Stepper:
