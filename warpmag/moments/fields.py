@@ -156,9 +156,8 @@ def wrench(
     check_bodies(f"positions: {n} moments that act on each other", n, context.dtype)
     m = context.vectors("moments", moments, n, least=LEAST_FORCE_MOMENT, shared=True)
     external = context.vectors("external_field", (0.0, 0.0, 0.0) if external_field is None else external_field, n)
-    shape = SumsShape(
-        Quantity.WRENCH, context.device.alias, context.dtype, n, size, reference=reference, smoothing=smoothing
-    )
+    options = {"reference": reference, "smoothing": smoothing}
+    shape = SumsShape(Quantity.WRENCH, context.device.alias, context.dtype, n, size, **options)
     with pair_sums(shape) as sums:
         _pack(context, "radii", radii, sums.moments, x, m)
         wp.copy(sums.base, external)

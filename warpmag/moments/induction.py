@@ -203,9 +203,7 @@ class _Balls:
         """Number n of balls."""
         return self.positions.shape[0]
 
-    def make_system(
-        self, context: CallContext, material: MomentMaterial, settings: SolverSettings, initial
-    ) -> MomentSystem:
+    def make_system(self, context: CallContext, material: MomentMaterial, settings, initial) -> MomentSystem:
         """Return a system of the balls, followed by the permanent dipoles, that starts from ``initial`` if given."""
         n, k = self.count, self.permanent_positions.shape[0]
 

@@ -305,9 +305,8 @@ def _piece_tensors(part: Pieces, p: np.ndarray, q: np.ndarray) -> np.ndarray:
         filled = _binary(_coarsened(part.filled, _SUBCELLS))
         result[near] = _cut_tensors(part.sides, filled, p[near], q[near], separation[near])
     if len(far):
-        result[far] = _cut_tensors(
-            part.sides, _coarsened(part.filled, _DISTANT_SUBCELLS), p[far], q[far], separation[far]
-        )
+        filled = _coarsened(part.filled, _DISTANT_SUBCELLS)
+        result[far] = _cut_tensors(part.sides, filled, p[far], q[far], separation[far])
     return result
 
 

@@ -80,9 +80,8 @@ class Polyhedron:
         longest, points = self.edge_rows()[:, 6].max(), []
         for face, normal in zip(self.faces, self.normals, strict=True):
             positions, weights = _gauss_points_on_face(self.corners[list(face)], longest, across)
-            points.append(
-                np.concatenate([positions, np.broadcast_to(normal, positions.shape), weights[:, None]], axis=1)
-            )
+            normals = np.broadcast_to(normal, positions.shape)
+            points.append(np.concatenate([positions, normals, weights[:, None]], axis=1))
         return np.concatenate(points)
 
 

@@ -44,11 +44,8 @@ def declare_attributes(builder: newton.ModelBuilder, usd_value: Callable[[Any, d
     from_usd = {} if usd_value is None else {"usd_attribute_name": "*", "usd_value_transformer": usd_value}
 
     def declare(name, dtype, default, **options):
-        shape = newton.Model.AttributeFrequency.SHAPE
-        attribute = newton.ModelBuilder.CustomAttribute(
-            name, dtype, shape, namespace=NAMESPACE, default=default, **options
-        )
-        builder.add_custom_attribute(attribute)
+        of_shapes, make = newton.Model.AttributeFrequency.SHAPE, newton.ModelBuilder.CustomAttribute
+        builder.add_custom_attribute(make(name, dtype, of_shapes, namespace=NAMESPACE, default=default, **options))
 
     for row in MAGNET_ATTRIBUTES:
         default = NO_MAGNET if row.field == "kind" else _stored(row, row.default)

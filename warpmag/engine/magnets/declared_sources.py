@@ -107,9 +107,8 @@ def add_field_map(
     name = "add_field_map"
     nodes, steps = host_array(f"{name}: values", values), host_array(f"{name}: spacing", spacing)
     first = host_array(f"{name}: origin", origin)
-    field_map = FieldMap(
-        tuple(np.atleast_1d(first)), tuple(np.resize(steps, 3) if steps.ndim == 0 else steps), nodes, factor
-    )
+    steps = np.resize(steps, 3) if steps.ndim == 0 else steps
+    field_map = FieldMap(tuple(np.atleast_1d(first)), tuple(steps), nodes, factor)
     field_map.check(name)
     return _add_source(builder, body, field_map.record(), factor, xform, "field_map", label)
 

@@ -45,9 +45,8 @@ def find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
     _, first, lattice_index = np.unique(
         np.stack([pair_index[first_rows], kinds]), axis=1, return_index=True, return_inverse=True
     )
-    lattices = [
-        sampler.sample(shapes[groups[group]].tolist(), magnets[pair_index[groups[group][0]]]) for group in first
-    ]
+    samples = [(shapes[groups[k]].tolist(), magnets[pair_index[groups[k][0]]]) for k in first]
+    lattices = [sampler.sample(*sample) for sample in samples]
     fixed = np.array([magnet.fixed for magnet in magnets])[pair_index[first_rows]]
     order = np.lexsort((shapes[first_rows], shape_bodies[first_rows], fixed, worlds))
     columns = (pair_index[first_rows], shape_bodies[first_rows], worlds, lattice_index.ravel())

@@ -370,9 +370,8 @@ class Magnetics:
         largest = max(float(magnet.lattice.radii.max()) for magnet in self.magnets)
         context = CallContext(self.system.device, self.system.dtype, warp_out=False)
         points = context.vectors("points", points, farthest=largest_coordinate(self.system.dtype, largest))
-        probe = FieldProbe(
-            self.system, len(points), worlds=self._world_indices(worlds, len(points)), gradients=gradients
-        )
+        indices = self._world_indices(worlds, len(points))
+        probe = FieldProbe(self.system, len(points), worlds=indices, gradients=gradients)
         wp.copy(probe.points, points)
         return probe
 

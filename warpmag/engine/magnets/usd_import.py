@@ -28,17 +28,11 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
         builder: The builder; declaring twice does nothing.
     """
     declare_attributes(builder, usd_value=_attribute_value)
-    builder.add_custom_frequency(
-        newton.ModelBuilder.CustomFrequency(
-            "source_prim", NAMESPACE, usd_prim_filter=_is_source, usd_entry_expander=_add_sources
-        )
-    )
+    name, functions = "source_prim", {"usd_prim_filter": _is_source, "usd_entry_expander": _add_sources}
+    builder.add_custom_frequency(newton.ModelBuilder.CustomFrequency(name, NAMESPACE, **functions))
     # without an attribute of this frequency Newton does not call the two functions
-    builder.add_custom_attribute(
-        newton.ModelBuilder.CustomAttribute(
-            "source_prim", str, f"{NAMESPACE}:source_prim", namespace=NAMESPACE, default=""
-        )
-    )
+    make, frequency = newton.ModelBuilder.CustomAttribute, f"{NAMESPACE}:{name}"
+    builder.add_custom_attribute(make(name, str, frequency, namespace=NAMESPACE, default=""))
 
 
 register_attributes = register_custom_attributes
