@@ -82,15 +82,9 @@ class SensorMagnetometer:
         find_sites(state.body_q, self._sites, self._probe.points)
         self._probe.measure()
         read_sites(
-            state.body_q,
-            self._sites,
-            self._probe.b,
-            noise=self._noise,
-            limit=self._saturation,
-            seed=self._seed,
-            reading_count=self._count,
-            readings=self.flux_density,
-        )
+            state.body_q, self._sites, self._probe.b, noise=self._noise, limit=self._saturation, seed=self._seed,
+            reading_count=self._count, readings=self.flux_density,
+        )  # fmt: skip
 
 
 def _find_sites(model: newton.Model, sites) -> list[int]:

@@ -93,14 +93,10 @@ class PileXPBD(newton.solvers.SolverXPBD):
         launch_accelerate(before, self.model.gravity, _KINEMATIC, dt, after.q, after.qd, *forces)
         self._find_shares(after, contacts, dt)
         contact_solve.launch_solve_contacts(
-            self._solve,
-            view_contacts(self.model, contacts),
-            after,
+            self._solve, view_contacts(self.model, contacts), after,
             None if self._split_bodies is None else self._shares,
-            iterations=self._contact_iterations,
-            relaxation=self.rigid_contact_relaxation,
-            dt=dt,
-        )
+            iterations=self._contact_iterations, relaxation=self.rigid_contact_relaxation, dt=dt,
+        )  # fmt: skip
         launch_move(after, _KINEMATIC, dt)
 
     def _find_shares(self, bodies: BodyView, contacts, dt: float) -> None:
