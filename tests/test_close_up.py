@@ -97,7 +97,7 @@ def near_system(half, device, dtype="float64", places=((0.0, 0.0, 0.0),), balls=
     )
 
     def put(places, balls):
-        positions = np.concatenate([*(body.places + p for p in places), np.reshape(balls, (-1, 3))])
+        positions = np.concatenate([*(body.positions + p for p in places), np.reshape(balls, (-1, 3))])
         moments = np.concatenate(
             [*(body.volumes[:, None] * magnetization for _ in places), *([[0.1, 0.0, 0.3]],) * len(balls)]
         )

@@ -44,14 +44,14 @@ def box(half, device, **settings):
     )  # fmt: skip
 
     def wrenches(place):
-        system.positions.assign(np.concatenate([[place], body.places]))
+        system.positions.assign(np.concatenate([[place], body.positions]))
         moments = np.zeros((n + 1, 3))
         moments[1:, 2] = 1e4 * body.volumes
         system.moments.assign(moments)
         system.solve()
         system.apply_forces()
         forces, torques = system.forces.numpy(), system.torques.numpy()
-        turn = torques[1:].sum(axis=0) + np.cross(body.places, forces[1:]).sum(axis=0)
+        turn = torques[1:].sum(axis=0) + np.cross(body.positions, forces[1:]).sum(axis=0)
         return np.concatenate([forces[0], forces[1:].sum(axis=0), turn])
 
     return wrenches
