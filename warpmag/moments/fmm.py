@@ -103,7 +103,7 @@ class FastSums:
     """Octree of boxes that hold moments, and sums over pairs for ``pairs.evaluate.PairEvaluation``."""
 
     def __init__(self, moments, rtol: float, targets=None, worlds: int = 1, extent: float = 0.0):
-        """Allocate the boxes of packed moments, at least one, and targets; None means the moments themselves.
+        """Allocate boxes for packed moments, at least one, and packed targets; None means the moments themselves.
 
         Overlapping pairs, and all pairs up to a distance ``extent`` [m], are summed one by one.
         """
@@ -132,7 +132,7 @@ class SystemSums(FastSums):
     """Sums over pairs of a system's moments, by multipoles where that is faster."""
 
     def __init__(self, moments, rtol: float, worlds: int, extent: float, crowding: float, always_from: float):
-        """Allocate the boxes, of ``crowding`` times the optimal number of moments.
+        """Allocate the boxes. Leaf boxes hold ``crowding`` times the optimal number of moments.
 
         ``always_from`` is the smallest number of pairs that multipoles sum even if they are slower.
         """

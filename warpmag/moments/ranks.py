@@ -47,7 +47,7 @@ _disabled = 0
 
 @cache
 def launched_ranks() -> "Ranks | None":
-    """Return the ranks that a launcher started, which need ``mpi4py``, or None in a single process."""
+    """Return the ranks that a launcher started, or None in a single process. Ranks need ``mpi4py``."""
     if all(os.environ.get(name, "1") == "1" for name in _COUNTS):
         return None
     try:

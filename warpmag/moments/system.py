@@ -38,8 +38,8 @@ from warpmag.shapes.demagnetization import Coupling
 class SolverSettings:
     """Settings of the induction solve and of the forces, most of them as in :func:`warpmag.solve_induction`.
 
-    ``single_torque`` computes the torque m × H also of an inducible ball of a single moment. It is 0 in equilibrium,
-    where m is parallel to H, and measures how far the solve is from it.
+    With ``single_torque`` the torque m × H is computed also for an inducible ball of a single moment. It is 0 in
+    equilibrium, where m is parallel to H, and measures the distance of the solve from equilibrium.
     """
 
     force: str = "kelvin"  # or ``zeeman``

@@ -98,7 +98,7 @@ class CellGrid:
 
 
 def cells_over(parts: Sequence[Solid], earlier: Sequence[Solid], spacing: float, across: int) -> CellGrid:
-    """Return a grid of cells, with sides of about ``spacing`` [m], over shapes of a body, without overlap with others.
+    """Return a grid of cells with sides of about ``spacing`` [m] over ``parts`` of a body, without ``earlier`` shapes.
 
     ``across`` is the smallest number of cells across a shape. In a shared grid ``_FLATTEST`` limits it.
     """

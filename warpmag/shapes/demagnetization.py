@@ -197,7 +197,7 @@ def _pair_law(r, a, b, same):
 
 
 def _part_tensors(part: Pieces, lattice: Lattice, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return near pairs of one grid, shape [2, pairs], and N_ij √(V_i V_j) over a cell's volume, shape [pairs, 6]."""
+    """Return near moments of a grid, shape [2, pairs], and N_ij √(V_i V_j) over a cell's volume, shape [pairs, 6]."""
     first, count = int(part.moment.min()), len(np.unique(part.moment))
     local = (lattice.positions[first : first + count] - part.position) @ part.rotation
     reach = reach * float(part.sides.max())

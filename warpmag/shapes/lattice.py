@@ -159,7 +159,7 @@ def mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
 
     Vertices at the same position are joined first. The triangles must then pass every edge equally often in both
     directions; either orientation of the whole mesh is accepted. Shells may intersect; shared volume counts once.
-    Vertices [m] have the shape [n, 3], triples of their indices [m, 3] or flat.
+    ``vertices`` [m] have the shape [n, 3]; ``faces`` are triples of their indices, shape [k, 3] or flat.
     """
     points, triangles = welded(vertices, faces)
     check_closed(triangles)

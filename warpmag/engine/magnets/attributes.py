@@ -102,7 +102,7 @@ def _stored(row: Attribute, value: Any) -> Any:
 
 
 def marked_shapes(model: newton.Model) -> dict[int, Magnet]:
-    """Return the magnets of a model by shape, in the frames of the shapes; raise :class:`InputError` without any."""
+    """Return the magnets of a model by shape, in the frames of the shapes; no magnets raise :class:`InputError`."""
     attributes = getattr(model, NAMESPACE, None)
     kinds = attributes.kind.numpy() if attributes is not None else np.zeros(0, int)
     marked = np.flatnonzero(kinds != NO_MAGNET)

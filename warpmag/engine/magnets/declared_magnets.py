@@ -109,14 +109,14 @@ def add_permanent(
 
 
 def in_shape_frame(magnet: Magnet, rotation: wp.quat) -> Magnet:
-    """Return a magnet in the frame of a shape, with the rotation from there to the frame of its body or prim."""
+    """Return a magnet in the frame of a shape; ``rotation`` leads from there to the frame of its body or prim."""
     if not np.any(magnet.magnetization):
         return magnet
     return replace(magnet, magnetization=tuple(wp.quat_rotate_inv(rotation, wp.vec3(*magnet.magnetization))))
 
 
 def axis_rotation(axis: str | None) -> Any:
-    """Return the rotation from a shape's frame to its prim's; ``axis`` is the prim's token, None for shapes without.
+    """Return the rotation from a shape's frame to the frame of its prim, from the prim's axis token or None.
 
     Newton's capsules, cylinders and cones have their axis along z.
     """
@@ -124,7 +124,7 @@ def axis_rotation(axis: str | None) -> Any:
 
 
 def magnet_shapes(builder: newton.ModelBuilder, body: int, shape: int | None = None) -> list[int]:
-    """Return the shapes of a magnet on ``body``, or on ``shape`` alone; raise :class:`InputError` without a solid."""
+    """Return the shapes of a magnet on ``body``, or on ``shape`` alone; no solid shape raises :class:`InputError`."""
     check_registered(builder)
     if shape is not None:
         check_index("shape", shape, builder.shape_count, "shapes")

@@ -135,7 +135,7 @@ def add_placed_source(
 def _add_source(
     builder: newton.ModelBuilder, body: int, record: SourceRecord, strength: float, xform, kind: str, label, keys=""
 ) -> int:
-    """Add a source to a body or to the world; return its site. Without a label it gets one of ``kind`` and number."""
+    """Add a source to a body or to the world; return its site. The default label is ``kind`` with a number."""
     check_registered(builder)
     label = f"{kind}_{builder.shape_count}" if label is None else label
     check_whole("body", body)

@@ -65,7 +65,7 @@ class ShapeSampler:
         self._lattices: dict[tuple, BodyLattice] = {}
 
     def sample(self, shapes: list[int], magnet: Magnet) -> BodyLattice:
-        """Return the moments of a magnet of shapes of one body, or of one static shape.
+        """Return the moments of a magnet: shapes of one body, or one static shape.
 
         At automatic spacing, separate balls are one moment each. All other shapes are filled with moments as one solid:
         the common volume of overlapping shapes belongs to the first of them. The fields of fixed moments are averaged

@@ -46,7 +46,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
     def __init__(self, model: newton.Model, contact_max: int, *, contact_iterations: int | None = None, **settings):
         """Set up Newton's solver with ``settings``, for contact buffers of ``contact_max`` entries.
 
-        ``kernels.contacts.solve`` runs ``contact_iterations``; by default Newton's ``iterations``.
+        ``kernels.contacts.solve`` has ``contact_iterations``, by default Newton's ``iterations``.
         """
         super().__init__(model, **settings)
         split_bodies = _find_split_bodies(model, self.body_inv_mass_effective.numpy())

@@ -50,7 +50,10 @@ class StageBuilder(newton.ModelBuilder):
         return new_colliders
 
     def with_original_meshes(self, shapes: list[int]) -> list[int]:
-        """Return ``shapes`` with closed original meshes, added without collision, for colliders of another volume."""
+        """Return ``shapes`` with the original meshes in place of colliders of another volume.
+
+        Only closed meshes count. They are added to the builder without collision.
+        """
         result = list(shapes)
         for shape in shapes:
             original = self.replaced.get(shape)

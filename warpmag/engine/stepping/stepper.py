@@ -86,7 +86,7 @@ class Stepper:
     ):
         """Allocate states and the state machine, for time steps and substeps of at most ``longest_substep`` [s].
 
-        ``graphs`` captures a step in a graph where the device and the solver allow it.
+        ``graphs`` means to capture a step in a graph where the device and the solver allow it.
         """
         self._model, self._magnetics, self._solver = model, magnetics, solver
         self._keyed_values, self._device, self._step = keyed_values, wp.get_device(model.device), step
@@ -384,7 +384,7 @@ def _arrays(state: newton.State | newton.Control) -> list[wp.array]:
 
 
 class _Clock:
-    """Measures the tick of the device's clock, ``seconds_per_tick`` after :meth:`calibrate`."""
+    """Measures the device's clock. :meth:`calibrate` sets the length ``seconds_per_tick`` of its tick."""
 
     def __init__(self, device):
         self._time = wp.zeros(1, dtype=wp.uint64, device=device)
