@@ -18,41 +18,24 @@ NAMESPACE = "warpmag"
 
 @dataclass(frozen=True)
 class Attribute:
-    """One row of the table.
+    """One row of the table."""
 
-    Attributes:
-        name: Name in USD, without the namespace.
-        usd_type: Type in USD: ``token``, ``float``, ``bool``, ``vector3f``, ``point3f``, ``int3`` or an array of them.
-        title: Name in user interfaces.
-        doc: Meaning, in one or two sentences.
-        unit: Unit as USD's own schemas write it, empty for tokens and flags; ``distance`` means the stage's unit.
-        range: Range of values in the documentation, empty where every finite value is valid.
-        tokens: Valid tokens.
-        check: Function of a name and a value. It raises an error with the name if the value is out of range. None for
-            tokens.
-        uniform: True if USD allows no time samples.
-        kind: Kind of magnets that the attribute describes, empty for all.
-        optional: True if warpmag omits the default from the stages that it writes.
-        model_change: Effect of a change of a Newton model's array: ``substep``, from the next substep on; ``notified``,
-            after ``Magnetics.notify_model_changed``; ``never``, an error.
-        field: Field of the record. Attributes of USD alone have a name in the same style.
-        default: Default, None where the attribute has none.
-    """
-
-    name: str
-    usd_type: str
-    title: str
-    doc: str
-    unit: str = ""
-    range: str = ""
-    tokens: tuple[str, ...] = ()
-    check: Callable[[str, Any], Any] | None = None
-    uniform: bool = False
-    kind: str = ""
-    optional: bool = False
+    name: str  # in USD, without the namespace
+    usd_type: str  # ``token``, ``float``, ``bool``, ``vector3f``, ``point3f``, ``int3`` or an array of them
+    title: str  # name in user interfaces
+    doc: str  # meaning, in one or two sentences
+    unit: str = ""  # as USD's own schemas write it, empty for tokens and flags; ``distance`` means the stage's unit
+    range: str = ""  # range of values in the documentation, empty where every finite value is valid
+    tokens: tuple[str, ...] = ()  # valid tokens
+    check: Callable[[str, Any], Any] | None = None  # function of name and value that raises an error; None for tokens
+    uniform: bool = False  # True if USD allows no time samples
+    kind: str = ""  # kind of magnets that the attribute describes, empty for all
+    optional: bool = False  # True if warpmag omits the default from the stages that it writes
+    # effect of a change of a Newton model's array: from the next substep on; after ``Magnetics.notify_model_changed``;
+    # an error
     model_change: Literal["substep", "notified", "never"] = "never"
-    field: str = ""
-    default: Any = None
+    field: str = ""  # field of the record; attributes of USD alone have a name in the same style
+    default: Any = None  # None where the attribute has no default
 
     @property
     def usd_name(self) -> str:
@@ -97,19 +80,12 @@ def check_fields(record: Any, owner: str, *names: str) -> None:
 
 @dataclass(frozen=True)
 class Schema:
-    """An applied API schema of USD.
+    """An applied API schema of USD."""
 
-    Attributes:
-        name: Name in USD.
-        record: The record that a prim with the schema declares.
-        doc: Meaning, in a few sentences.
-        usd_only: Rows of attributes without a field of the record.
-    """
-
-    name: str
-    record: type
-    doc: str
-    usd_only: tuple[Attribute, ...] = ()
+    name: str  # in USD
+    record: type  # the record that a prim with the schema declares
+    doc: str  # meaning, in a few sentences
+    usd_only: tuple[Attribute, ...] = ()  # rows of attributes without a field of the record
 
     @property
     def attributes(self) -> tuple[Attribute, ...]:

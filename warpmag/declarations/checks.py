@@ -90,12 +90,7 @@ def check_count(name: str, value: Any) -> None:
 
 
 def joint_ends_apart(gap, distance):
-    """Return True if the ends of joints count as apart.
-
-    Args:
-        gap: Distance between the ends [m], a number or an array.
-        distance: Distance of one end from the origin [m], of the same shape.
-    """
+    """Return True for ends of joints with a gap [m] that counts, at a distance [m] of one end from the origin."""
     return gap > _JOINT_GAP + _JOINT_ROUNDING * distance
 
 

@@ -55,11 +55,7 @@ def check_spacing(name: str, value: Any) -> None:
 
 
 def checked_vectors(name: str, values: Any, most: float) -> np.ndarray:
-    """Return vectors as an array of shape [k, 3].
-
-    Raises:
-        InputError: The values are no vectors, or a component is not finite or exceeds ``most``.
-    """
+    """Return vectors, shape [k, 3]; raise :class:`InputError` if a component is not finite or exceeds ``most``."""
     try:
         array = np.asarray(values)
     except ValueError:  # a ragged list
@@ -75,17 +71,11 @@ def checked_vectors(name: str, values: Any, most: float) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class SourceRecord:
-    """Data of one source for the kernels, in the frame of the source.
+    """Data of one source for the kernels, in the frame of the source."""
 
-    Attributes:
-        kind: Name of a ``kernels.applied.sources.SourceKind``, in lower case.
-        parameters: Numbers of the kind.
-        table: Vectors of the kind, shape [k, 3].
-    """
-
-    kind: str
-    parameters: tuple[float, ...]
-    table: np.ndarray
+    kind: str  # name of a ``kernels.applied.sources.SourceKind``, in lower case
+    parameters: tuple[float, ...]  # numbers of the kind
+    table: np.ndarray  # vectors of the kind, shape [k, 3]
 
     def to_text(self) -> str:
         """Return the record as a line of text that keeps every bit of its numbers."""

@@ -74,8 +74,7 @@ class MagnetizationCurve:
         Raises:
             InputError: The points are no magnetization curve; the message names the reason and the point.
         """
-        h, b = _numbers(name, "fields", fields), _numbers(name, "flux densities", flux_densities)
-        _check_count(name, h, b)
+        h, b = _points(name, fields, "flux densities", flux_densities)
         return cls._from_points(name, h, b / MU0 - h, saturation)
 
     @classmethod
@@ -88,8 +87,7 @@ class MagnetizationCurve:
         name: str = "curve",
     ) -> Self:
         """Return the curve of magnetizations M [A/m] at fields H [A/m]; see :meth:`from_bh`."""
-        h, m = _numbers(name, "fields", fields), _numbers(name, "magnetizations", magnetizations)
-        _check_count(name, h, m)
+        h, m = _points(name, fields, "magnetizations", magnetizations)
         return cls._from_points(name, h, m, saturation)
 
     @classmethod
@@ -158,19 +156,15 @@ class MagnetizationCurve:
 
 
 def _slopes(h, m):
-    """Return the slopes dM/dH at the points, by PCHIP.
-
-    At the last point the slope is that of the law of approach to saturation. At the origin it is that of the curve
-    joined to its mirror image.
-    """
+    """Return the slopes dM/dH at the points, by PCHIP."""
     span, secant = np.diff(h), np.diff(m) / np.diff(h)
     slope = np.empty(len(h))
-    slope[0] = secant[0]
+    slope[0] = secant[0]  # of the curve joined to its mirror image
     weight, other = 2.0 * span[1:] + span[:-1], span[1:] + 2.0 * span[:-1]
     rising = (secant[:-1] > 0.0) & (secant[1:] > 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         slope[1:-1] = np.where(rising, (weight + other) / (weight / secant[:-1] + other / secant[1:]), 0.0)
-    slope[-1] = secant[-1] * h[-2] / h[-1]
+    slope[-1] = secant[-1] * h[-2] / h[-1]  # by the law of approach to saturation
     return slope
 
 
@@ -191,11 +185,14 @@ def _numbers(name: str, quantity: str, values) -> np.ndarray:
     return array
 
 
-def _check_count(name: str, h, other) -> None:
-    if len(h) != len(other):
-        raise InputError(f"{name}: {len(h)} fields, but {len(other)} values at them")
+def _points(name: str, fields, quantity: str, values) -> tuple[np.ndarray, np.ndarray]:
+    """Return the fields at the points of a curve, and as many values of another quantity."""
+    h, others = _numbers(name, "fields", fields), _numbers(name, quantity, values)
+    if len(h) != len(others):
+        raise InputError(f"{name}: {len(h)} fields, but {len(others)} values at them")
     if not 2 <= len(h) <= _LARGEST_COUNT:
         raise InputError(f"{name}: a curve has 2 to {_LARGEST_COUNT} points, got {len(h)}")
+    return h, others
 
 
 def _check_points(name: str, h, m) -> None:

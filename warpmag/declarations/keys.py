@@ -1,7 +1,4 @@
-"""Values keyed over time, and motions of keyed transforms. A stage holds them; a device interpolates them.
-
-No Warp, Newton or USD is imported here.
-"""
+"""Values keyed over time, and motions of keyed transforms. A stage holds them; a device interpolates them."""
 
 import json
 from dataclasses import asdict, dataclass, replace
@@ -11,17 +8,11 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Keys:
-    """Values keyed over time: interpolated between keys, constant before the first and after the last.
+    """Values keyed over time: interpolated between keys, constant before the first and after the last."""
 
-    Attributes:
-        times: Rising times, shape [k]: time codes while a stage is read, then seconds since the start.
-        values: Value of each key, float64, shape [k, width].
-        interpolation: ``linear``, ``held``, or ``slerp`` for quaternions x y z w.
-    """
-
-    times: np.ndarray
-    values: np.ndarray
-    interpolation: str = "linear"
+    times: np.ndarray  # rising, shape [k]: time codes while a stage is read, then seconds since the start
+    values: np.ndarray  # value of each key, float64, shape [k, width]
+    interpolation: str = "linear"  # or ``held``, or ``slerp`` for quaternions x y z w
 
     @classmethod
     def constant(cls, values) -> "Keys":
@@ -29,12 +20,7 @@ class Keys:
         return cls(np.zeros(1), np.reshape(np.asarray(values, dtype=float), (1, -1)))
 
     def in_seconds(self, start: float, rate: float) -> "Keys":
-        """Return the keys with times in seconds since the start in place of time codes.
-
-        Args:
-            start: Time code of the start.
-            rate: Time codes per second.
-        """
+        """Return the keys with times in seconds since the time code ``start``, at ``rate`` time codes per second."""
         return replace(self, times=(self.times - start) / rate)
 
     def to_text(self) -> str:
@@ -52,27 +38,20 @@ class Keys:
 class Operation:
     """One keyed transform of a stack.
 
-    Attributes:
-        kind: ``translate``, ``scale``, ``orient``, ``matrix``, or ``rotate`` with the order of its axes: ``rotateXYZ``
-            rotates about x first. A matrix has 16 numbers by rows, for row vectors, as in USD.
-        keys: Numbers of the transform; three angles [degrees] for ``rotate``.
-        inverse: True if the inverse of the transform applies.
+    The kinds are ``translate``, ``scale``, ``orient``, ``matrix``, and ``rotate`` with the order of its axes:
+    ``rotateXYZ`` rotates about x first. A matrix has 16 numbers by rows, for row vectors, as in USD.
     """
 
     kind: str
-    keys: Keys
-    inverse: bool = False
+    keys: Keys  # numbers of the transform; three angles [degrees] for ``rotate``
+    inverse: bool = False  # True if the inverse of the transform applies
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of a frame in the world.
+    """Motion of a frame in the world."""
 
-    Attributes:
-        operations: Stack of transforms, the outermost first: the last acts on points first.
-    """
-
-    operations: tuple[Operation, ...]
+    operations: tuple[Operation, ...]  # stack of transforms, the outermost first: the last acts on points first
 
     def in_seconds(self, start: float, rate: float) -> "Motion":
         """Return the motion with times in seconds, see :meth:`Keys.in_seconds`."""
@@ -81,16 +60,9 @@ class Motion:
 
 @dataclass(frozen=True)
 class SceneKeys:
-    """All keyed values of a scene, times in seconds since the start.
+    """All keyed values of a scene, times in seconds since the start."""
 
-    Attributes:
-        motions: Motions of kinematic bodies, by body.
-        magnetizations: Magnetizations of permanent magnets [A/m], in the frames of their shapes, by shape.
-        currents: Ampere-turns of coils [A], by shape.
-        field: External field [A/m], None where it is constant.
-    """
-
-    motions: dict[int, Motion]
-    magnetizations: dict[int, Keys]
-    currents: dict[int, Keys]
-    field: Keys | None = None
+    motions: dict[int, Motion]  # of kinematic bodies, by body
+    magnetizations: dict[int, Keys]  # of permanent magnets [A/m], in the frames of their shapes, by shape
+    currents: dict[int, Keys]  # ampere-turns of coils [A], by shape
+    field: Keys | None = None  # external field [A/m], None where it is constant

@@ -1,6 +1,6 @@
 """Records of magnets and of the settings of a scene, with their rows of the table of attributes.
 
-No Warp, Newton or USD is imported here. Stages, the command line and scripts check values through these records.
+Stages, the command line and scripts check values through these records.
 """
 
 import math
@@ -40,10 +40,7 @@ SATURATION_OF_IRON = 1.7e6
 
 
 def check_curve(name: str, value: Any, others: tuple[str, ...] = ()) -> None:
-    """Raise :class:`InputError` unless ``value`` is one of :data:`CURVES` or a measured curve.
-
-    The message also lists ``others``, further valid names.
-    """
+    """Raise :class:`InputError` unless ``value`` is measured or in :data:`CURVES`; the message adds ``others``."""
     if not isinstance(value, MagnetizationCurve) and not (isinstance(value, str) and value in CURVES):
         check_token(name, value, (*CURVES, *others))
 

@@ -116,12 +116,7 @@ def material(name: str) -> Material:
 def inducible(owner: str, name: str) -> dict:
     """Return saturation [A/m] and susceptibility of an inducible material, or its curve, as fields of a ``Magnet``.
 
-    Args:
-        owner: Prim or argument, for the message.
-        name: The material.
-
-    Raises:
-        InputError: There is no such material, or it is a permanent one.
+    ``owner`` is the prim or the argument in the message of an unknown or permanent material.
     """
     entry = _look_up(owner, name, "inducible")
     if entry.curve is not None:
@@ -130,15 +125,10 @@ def inducible(owner: str, name: str) -> dict:
 
 
 def inducible_from(material: str | None, curve, numbers: dict) -> dict:
-    """Return the fields of an inducible ``Magnet`` from a material, a curve and numbers.
+    """Return the fields of an inducible ``Magnet`` from a material, a curve for :func:`measured`, and numbers.
 
-    Args:
-        material: Name of a material, or None.
-        curve: A curve as :func:`measured` takes it, or None.
-        numbers: Values of ``saturation`` [A/m] and ``susceptibility``, as far as given.
-
-    Raises:
-        InputError: Two of the arguments set the same field.
+    ``numbers`` are the given ones of ``saturation`` [A/m] and ``susceptibility``. Two arguments that set the same field
+    raise :class:`InputError`.
     """
     values = numbers if curve is None else {**numbers, "curve": measured("curve", curve)}
     has_table = isinstance(values.get("curve"), MagnetizationCurve)
@@ -153,11 +143,7 @@ def inducible_from(material: str | None, curve, numbers: dict) -> dict:
 
 
 def measured(owner: str, curve):
-    """Return the measured curve of a material for its name; return a token or a measured curve unchanged.
-
-    Raises:
-        InputError: The value is none of these.
-    """
+    """Return the measured curve of a material for its name; return a token or a measured curve unchanged."""
     names = [entry.name for entry in MATERIALS.values() if entry.curve is not None]
     if isinstance(curve, str) and curve in names:
         return MATERIALS[curve].curve
@@ -173,13 +159,7 @@ def name_of_curve(curve: MagnetizationCurve) -> str | None:
 def permanent(owner: str, name: str, direction: tuple[float, float, float]) -> tuple[float, float, float]:
     """Return the magnetization [A/m] of a permanent material along a direction of any length.
 
-    Args:
-        owner: Prim or argument, for the message.
-        name: The material.
-        direction: Direction of the magnetization.
-
-    Raises:
-        InputError: There is no such material, it is an inducible one, or the direction has no length.
+    ``owner`` is the prim or the argument in the message of an unknown or inducible material, or of a zero direction.
     """
     entry = _look_up(owner, name, "permanent")
     length = math.hypot(*direction)

@@ -12,11 +12,7 @@ _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 def usable_path(path: str | os.PathLike) -> Path:
-    """Return a path that USD can name, ``~`` expanded.
-
-    Raises:
-        InputError: USD cannot name the path in a layer or in a message.
-    """
+    """Return a path, ``~`` expanded; raise :class:`InputError` if USD cannot name it in a layer or in a message."""
     text = os.fsdecode(path)
     if not text:
         raise InputError("the path of a file must not be empty")
@@ -43,12 +39,9 @@ def full_path(path: Path) -> Path:
 
 
 def path_between(layer: Path, target: Path) -> str:
-    """Return the path by which ``layer`` names ``target``: relative where possible, otherwise absolute.
-
-    The relative path must hold from the layer's folder and from a link to that folder.
-    """
+    """Return the path by which ``layer`` names ``target``: relative where possible, otherwise absolute."""
     short = os.path.relpath(full_path(target), layer.parent.resolve())
-    for folder in (layer.parent.resolve(), full_path(layer).parent):
+    for folder in (layer.parent.resolve(), full_path(layer).parent):  # the latter may be a link to the former
         joined = os.path.normpath(os.path.join(folder, short))
         if not (os.path.exists(joined) and os.path.samefile(joined, target)):
             return str(full_path(target))

@@ -31,7 +31,6 @@ MATERIAL = MAGNET_SCHEMA.usd_name("material")
 CURVE_POINTS = MAGNET_SCHEMA.usd_name("curve_fields"), MAGNET_SCHEMA.usd_name("curve_flux_densities")
 """Points of a measured curve: H [A/m] inside the material, and B [T]."""
 _CURVE = MAGNET_SCHEMA.usd_name("curve")
-_MAGNETIZATION = MAGNET_SCHEMA.usd_name("magnetization")
 _SET_BY_CURVE = ("saturation", "susceptibility", "curve")
 """Fields that a measured curve sets."""
 
@@ -97,11 +96,7 @@ def author(prim: Usd.Prim, attribute: Attribute, value: Any) -> None:
 
 
 def read_fields(prim: Usd.Prim, attributes: Iterable[Attribute]) -> dict[str, Any]:
-    """Return the values of attributes of ``prim`` by field, without those that have no value.
-
-    Raises:
-        InputError: A value has the wrong type. The value itself is unchecked.
-    """
+    """Return the values of attributes of ``prim`` by field, without those without value; check only their types."""
     values = {}
     for row in attributes:
         attribute = prim.GetAttribute(row.usd_name)
@@ -137,17 +132,11 @@ def _magnet_prim(collider: Usd.Prim) -> Usd.Prim | None:
 
 @dataclass(frozen=True)
 class ColliderMagnet:
-    """The magnet of one collider, for the shape that Newton makes of the collider.
+    """The magnet of one collider, for the shape that Newton makes of the collider."""
 
-    Attributes:
-        magnet: The magnet, magnetization in the frame of the prim that declares it.
-        frames: World matrices of that prim and of the collider, for row vectors; empty where the prims are the same.
-        axis: Token of the axis of a capsule, cylinder or cone, None for other shapes.
-    """
-
-    magnet: Magnet
-    frames: tuple[np.ndarray, ...]
-    axis: str | None
+    magnet: Magnet  # magnetization in the frame of the prim that declares it
+    frames: tuple[np.ndarray, ...]  # world matrices of that prim and of the collider, for row vectors; or none if equal
+    axis: str | None  # token of the axis of a capsule, cylinder or cone, None for other shapes
 
 
 def collider_magnet(collider: Usd.Prim) -> ColliderMagnet | None:
@@ -216,12 +205,9 @@ def _with_curve(prim: Usd.Prim, magnet: Magnet) -> Magnet:
 
 def _author_curve(prim: Usd.Prim, curve: MagnetizationCurve) -> None:
     """Author a measured curve: the name of its material where there is one, otherwise its points."""
-    if name := materials.name_of_curve(curve):
-        (row,) = (row for row in attributes_of(Magnet) if row.field == "curve")
-        author(prim, row, name)
-        return
-    values = {"curve_fields": curve.fields, "curve_flux_densities": curve.flux_densities}
-    author_schema(prim, MAGNET_SCHEMA, values)
+    points = {"curve_fields": curve.fields, "curve_flux_densities": curve.flux_densities}
+    name = materials.name_of_curve(curve)
+    author_schema(prim, MAGNET_SCHEMA, {"curve": name} if name else points)
 
 
 def settings_of(prim: Usd.Prim) -> MagneticSettings:

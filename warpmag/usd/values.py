@@ -33,29 +33,18 @@ _RANGES = {  # least, largest, and whether 0 means "not given"
     "physics:angularVelocity": (-1e8, 1e8, False),
     "physics:gravityMagnitude": (0.0, 1e6, False),
     "physics:gravityDirection": (-1e9, 1e9, False),
-    "physics:staticFriction": _COEFFICIENT,
-    "physics:dynamicFriction": _COEFFICIENT,
     "physics:restitution": (0.0, 1.0, False),
-    "newton:torsionalFriction": _COEFFICIENT,
-    "newton:rollingFriction": _COEFFICIENT,
-    "newton:contactMargin": (0.0, LARGEST_SIZE, False),
-    "newton:contactGap": (0.0, LARGEST_SIZE, False),
-    "newton:contactStiffness": (0.0, LARGEST, False),
-    "newton:contactDamping": (0.0, LARGEST, False),
-    "newton:contactAdhesion": (0.0, LARGEST, False),
-    "newton:contactFrictionGain": (0.0, LARGEST, False),
+    **dict.fromkeys(("physics:staticFriction", "physics:dynamicFriction"), _COEFFICIENT),
+    **dict.fromkeys(("newton:torsionalFriction", "newton:rollingFriction"), _COEFFICIENT),
+    **dict.fromkeys(("newton:contactMargin", "newton:contactGap"), (0.0, LARGEST_SIZE, False)),
+    **dict.fromkeys(("newton:contactStiffness", "newton:contactDamping"), (0.0, LARGEST, False)),
+    **dict.fromkeys(("newton:contactAdhesion", "newton:contactFrictionGain"), (0.0, LARGEST, False)),
     "newton:timeStepsPerSecond": (1, 1_000_000, False),
 }
-_TOKENS = {
-    **dict.fromkeys(("axis", "physics:axis"), ("X", "Y", "Z")),
-    "orientation": ("rightHanded", "leftHanded"),
-}
+_TOKENS = {**dict.fromkeys(("axis", "physics:axis"), ("X", "Y", "Z")), "orientation": ("rightHanded", "leftHanded")}
 _QUATERNIONS = ("physics:principalAxes", "physics:localRot0", "physics:localRot1")
 _INERTIA_TOLERANCE = 1e-2
-"""Largest excess of a moment of inertia over the sum of the other two, as a fraction of the sum of all three.
-
-Moments of inertia are often rounded.
-"""
+"""Largest excess of an often rounded moment of inertia over the other two, as a fraction of the sum of all three."""
 _READ = ("physics:", "newton:", "mjc:", "drive:", "limit:")
 _SHAPES = {
     "Sphere": ("radius",),
@@ -93,17 +82,11 @@ _OPTIONS = ("newton:joint_drive_gains_scaling", "newton:collapse_fixed_joints")
 
 @dataclass(frozen=True)
 class Finding:
-    """An error or a warning about a stage.
+    """An error or a warning about a stage."""
 
-    Attributes:
-        where: Path of the prim, or the name of the stage.
-        message: Description of the error.
-        severity: ``error`` (a run does not start) or ``warning``.
-    """
-
-    where: str
+    where: str  # path of the prim, or the name of the stage
     message: str
-    severity: str = "error"
+    severity: str = "error"  # ``error``: a run does not start; or ``warning``
 
     def __str__(self) -> str:
         """Return one line that names the prim."""
@@ -128,9 +111,8 @@ def finding_of(where: str, error: InputError) -> Finding:
 def value_of(prim: Usd.Prim, name: str):
     """Return the default value of an attribute, None where it has none.
 
-    Raises:
-        InputError: The value is not of the schema's type, not finite or out of range. Infinities are valid only
-            where they are the schema's defaults, such as those of limits.
+    A value of another type than the schema's, not finite or out of range raises :class:`InputError`. Infinities are
+    valid only where they are the schema's defaults, such as those of limits.
     """
     attribute = prim.GetAttribute(name)
     if not attribute:
@@ -156,9 +138,7 @@ def value_of(prim: Usd.Prim, name: str):
 def attribute_findings(prim: Usd.Prim, *, shape: bool) -> Iterator[Finding]:
     """Yield errors and warnings about the attributes that Newton's importer reads from a prim, except transforms.
 
-    Args:
-        prim: Any prim.
-        shape: Whether to check also the attributes of its shape.
+    ``shape`` adds the attributes of the prim's shape.
     """
     names = [name for name in prim.GetAuthoredPropertyNames() if name.startswith(_READ)]
     for name in (*names, *(_SHAPES.get(prim.GetTypeName(), ()) if shape else ())):
@@ -214,12 +194,7 @@ def instance_finding(attribute: Usd.Attribute) -> Finding | None:
 
 
 def number(name: str, value) -> float:
-    """Return the shortest decimal that rounds to a number in single precision: 0.001, not 0.0010000000475.
-
-    Args:
-        name: Prim and attribute, for the message.
-        value: Value of the attribute; hand-written files can give it any type.
-    """
+    """Return the shortest decimal that rounds to a number in single precision: 0.001, not 0.0010000000475."""
     if not isinstance(value, numbers.Real) or isinstance(value, bool):
         raise InputError(f"{name}: {_shown(value)} is not a float")
     with np.errstate(over="ignore"):

@@ -4,14 +4,14 @@
 run is a few arrays.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd
 
-from warpmag.usd.read.identical_balls import INSTANCE_ARRAYS, BallFrames, IdenticalBalls
+from warpmag.usd.read.identical_balls import INSTANCE_ARRAYS, BallFrames, IdenticalBalls, rows_of
 from warpmag.usd.schemas import MAGNET_API, has_api
 
 
@@ -55,9 +55,7 @@ class BallInstancer:
     def with_copies(self, shapes: Sequence[Any], bodies: Sequence[str]) -> list[Any]:
         """Return drawn shapes, each followed by its copies in identical balls without prims.
 
-        Args:
-            shapes: Dataclass records with the ``path`` of a shape and the ``row`` of its body.
-            bodies: Paths of the bodies.
+        Shapes are dataclass records with the ``path`` of a shape and the ``row`` of its body in the paths ``bodies``.
         """
         rows, copied = {path: row for row, path in enumerate(bodies)}, []
         shape_copies, body_copies = self.copies_of([shape.path for shape in shapes]), self.copies_of(self.bodies)
@@ -80,17 +78,18 @@ class BallInstancer:
 
     def poses(self, arrays: dict[str, np.ndarray]) -> np.ndarray:
         """Return positions [m] and quaternions (x, y, z, w) of the balls in the world, shape [n, 7]."""
-        poses = np.empty((len(self.bodies), 7))
-        for balls, frames in zip(self.groups, self.frames, strict=True):
-            poses[balls.rows] = frames.poses(_rows_of(arrays, balls.rows))
-        return poses
+        return self._per_ball(7, BallFrames.poses, arrays)
 
     def velocities(self, arrays: dict[str, np.ndarray]) -> np.ndarray:
         """Return linear [m/s] and angular velocities [rad/s] in the world, shape [n, 6]; zero where none are given."""
-        velocities = np.zeros((len(self.bodies), 6))
+        return self._per_ball(6, BallFrames.velocities, arrays)
+
+    def _per_ball(self, width: int, evaluate: Callable, arrays: dict[str, np.ndarray]) -> np.ndarray:
+        """Return the results of a method of :class:`BallFrames` for the arrays of all balls, shape [n, width]."""
+        values = np.empty((len(self.bodies), width))
         for balls, frames in zip(self.groups, self.frames, strict=True):
-            velocities[balls.rows] = frames.velocities(_rows_of(arrays, balls.rows))
-        return velocities
+            values[balls.rows] = evaluate(frames, rows_of(arrays, balls.rows))
+        return values
 
 
 def ball_instancers(stage: Usd.Stage, deferred: Sequence[IdenticalBalls]) -> list[BallInstancer]:
@@ -100,10 +99,6 @@ def ball_instancers(stage: Usd.Stage, deferred: Sequence[IdenticalBalls]) -> lis
         if balls.stays_instancer:
             groups.setdefault(balls.instancer, []).append(balls)
     return [BallInstancer(stage, group) for group in groups.values()]
-
-
-def _rows_of(arrays: dict[str, np.ndarray], rows: np.ndarray) -> dict[str, np.ndarray]:
-    return {name: values[rows] if len(values) else values for name, values in arrays.items()}
 
 
 def _magnet_in(stage: Usd.Stage, balls: IdenticalBalls) -> Usd.Prim | None:

@@ -85,14 +85,28 @@ def check(path: str | os.PathLike) -> StageReport:
 
 
 def inspect(stage: Usd.Stage, path: str | os.PathLike) -> StageReport:
-    """Return the report of :func:`check` on an open stage.
-
-    Args:
-        stage: A stage from :func:`open_stage`.
-        path: File of the stage.
-    """
+    """Return the report of :func:`check` on a stage that :func:`open_stage` opened from the file ``path``."""
     with usd_errors(str(path)):
-        return _report(stage, path)
+        contents = survey(stage)
+        findings = [*contents.findings, *joint_findings(stage, contents.motions)]
+        try:
+            clock = stage_clock(stage)
+        except InputError as error:
+            clock = None
+            where, _, message = str(error).rpartition(": ")
+            findings.append(Finding(where, message))
+        rules, units = validate(file_of(stage)), units_of(stage)
+        findings += [replace(rule, severity="warning") for rule in rules]
+        return StageReport(
+            path=str(path),
+            meters_per_unit=units.meters,
+            kilograms_per_unit=units.kilograms,
+            up_axis=UsdGeom.GetStageUpAxis(stage),
+            clock=clock,
+            contents=contents,
+            findings=tuple(sorted(dict.fromkeys(findings), key=lambda finding: finding.severity != "error")),
+            broken_rules=tuple(rule for rule in rules if rule.severity == "error"),
+        )
 
 
 def _add_balls(contents: StageContents, instancer: BallInstancer) -> None:
@@ -103,29 +117,6 @@ def _add_balls(contents: StageContents, instancer: BallInstancer) -> None:
             paths[position:position] = copies
     for prim, copies in instancer.copies_of(list(contents.magnets)).items():
         contents.magnets |= dict.fromkeys(copies, contents.magnets[prim])
-
-
-def _report(stage: Usd.Stage, path: str | os.PathLike) -> StageReport:
-    contents = survey(stage)
-    findings = [*contents.findings, *joint_findings(stage, contents.motions)]
-    try:
-        clock = stage_clock(stage)
-    except InputError as error:
-        clock = None
-        where, _, message = str(error).rpartition(": ")
-        findings.append(Finding(where, message))
-    rules, units = validate(file_of(stage)), units_of(stage)
-    findings += [replace(rule, severity="warning") for rule in rules]
-    return StageReport(
-        path=str(path),
-        meters_per_unit=units.meters,
-        kilograms_per_unit=units.kilograms,
-        up_axis=UsdGeom.GetStageUpAxis(stage),
-        clock=clock,
-        contents=contents,
-        findings=tuple(sorted(dict.fromkeys(findings), key=lambda finding: finding.severity != "error")),
-        broken_rules=tuple(rule for rule in rules if rule.severity == "error"),
-    )
 
 
 @quiet()

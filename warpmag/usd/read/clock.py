@@ -17,21 +17,13 @@ _MOST_FRAMES = 10_000_000
 
 @dataclass(frozen=True)
 class StageClock:
-    """Time range and rates of a stage.
+    """Time range and rates of a stage."""
 
-    Attributes:
-        start: First time code.
-        end: Last time code; equal to ``start`` where the stage has no range.
-        time_codes_per_second: Time codes per second.
-        frames_per_second: Rate of the output frames [Hz].
-        step: Time step of the physics [s], None where the stage has none.
-    """
-
-    start: float
-    end: float
+    start: float  # first time code
+    end: float  # last time code; equal to ``start`` where the stage has no range
     time_codes_per_second: float
-    frames_per_second: float
-    step: float | None
+    frames_per_second: float  # rate of the output frames [Hz]
+    step: float | None  # time step of the physics [s], None where the stage has none
 
 
 def stage_name(stage: Usd.Stage) -> str:

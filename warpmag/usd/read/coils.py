@@ -18,7 +18,7 @@ from warpmag.errors import InputError
 from warpmag.usd.read.clock import stage_clock
 from warpmag.usd.read.keys import KeyReader
 from warpmag.usd.read.prims import body_of
-from warpmag.usd.read.transforms import TransformCheck
+from warpmag.usd.read.transforms import SCALE_TOLERANCE, TransformCheck
 from warpmag.usd.schemas import author_schema, has_api, read_fields, world_matrix
 from warpmag.usd.values import Finding, finding_of, instance_finding, number
 
@@ -26,29 +26,18 @@ Source = TypeVar("Source", Coil, FieldMap)
 _AMPERE_TURNS = COIL_SCHEMA.usd_name("ampere_turns")
 _BORDER_WARNING = 0.05
 """Largest field on the boundary of a map without a warning, as a fraction of its largest field."""
-_SCALE_TOLERANCE = 1e-5
-"""Largest relative difference of the scales of a frame: poses are often in single precision."""
 
 
 @dataclass(frozen=True)
 class PlacedSource:
-    """A coil or a field map of a stage.
+    """A coil or a field map of a stage."""
 
-    Attributes:
-        prim: Path of the prim that declares it.
-        source: The coil or the map, in meters of the world.
-        body: Path of the rigid body that it moves with, None where it is fixed in the world.
-        position: Origin of its frame in the world [m].
-        rotation: Rotation of its frame, a quaternion x y z w.
-        currents: Keys of a coil's ampere-turns [A] at time codes, None where they are constant.
-    """
-
-    prim: str
-    source: Coil | FieldMap
-    body: str | None
-    position: tuple[float, float, float]
-    rotation: tuple[float, float, float, float]
-    currents: Keys | None = None
+    prim: str  # path of the prim that declares it
+    source: Coil | FieldMap  # in meters of the world
+    body: str | None  # path of the rigid body that it moves with, None where it is fixed in the world
+    position: tuple[float, float, float]  # origin of its frame in the world [m]
+    rotation: tuple[float, float, float, float]  # rotation of its frame, a quaternion x y z w
+    currents: Keys | None = None  # of a coil's ampere-turns [A] at time codes, None where they are constant
 
 
 def author_coil(prim: Usd.Prim, coil: Coil) -> None:
@@ -99,11 +88,7 @@ def sources_of(prim: Usd.Prim, transforms: TransformCheck, keys: KeyReader) -> I
 
 
 def placed_sources(prim: Usd.Prim) -> list[PlacedSource]:
-    """Return the coil and the field map that a prim declares, with keys of currents in seconds since the start.
-
-    Raises:
-        InputError: An error was found.
-    """
+    """Return the coil and the field map that a prim declares, with keys of currents in seconds since the start."""
     stage, sources = prim.GetStage(), []
     for source in sources_of(prim, TransformCheck(), KeyReader(stage)):
         if isinstance(source, Finding):
@@ -188,7 +173,7 @@ def _frame(prim):
     matrix = UsdGeom.XformCache(Usd.TimeCode.Default()).GetLocalToWorldTransform(prim)
     axes = np.array(matrix)[:3, :3]
     scales = np.linalg.norm(axes, axis=1)
-    if np.ptp(scales) > _SCALE_TOLERANCE * scales.max() or np.linalg.det(axes) < 0.0:
+    if np.ptp(scales) > SCALE_TOLERANCE * scales.max() or np.linalg.det(axes) < 0.0:
         raise InputError(f"{prim.GetPath()}: a coil or a field map must not be mirrored or have a non-uniform scale")
     quaternion = Gf.Matrix3d((axes / scales[:, None]).tolist()).ExtractRotation().GetQuat()
     rotation = (*quaternion.GetImaginary(), quaternion.GetReal())

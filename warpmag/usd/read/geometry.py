@@ -29,7 +29,7 @@ def magnet_findings(prim: Usd.Prim) -> Iterator[Finding]:
     if not prim.IsA(UsdGeom.Mesh):
         yield from _size_findings(prim, _LARGEST_MAGNET)
         return
-    points, counts, indices = (np.asarray(value) for value in _topology(prim))
+    points, counts, indices = (np.asarray(value) for value in _topology(prim)[:3])
     try:
         lattice.mesh(points.astype(float) @ _axes(prim), _triangles(counts, indices))
     except InputError as error:
@@ -57,8 +57,7 @@ def spacing_findings(magnet: Usd.Prim, colliders: list[Usd.Prim], spacing: float
 def mesh_findings(prim: Usd.Prim) -> Iterator[Finding]:
     """Yield errors in the faces of a visual mesh, which may have none."""
     try:
-        points, counts, indices = _topology(prim)
-        holes = value_of(prim, "holeIndices")
+        points, counts, indices, holes = _topology(prim)
     except InputError as error:
         yield finding_of(str(prim.GetPath()), error)
         return
@@ -84,8 +83,7 @@ def _size_findings(prim, largest) -> Iterator[Finding]:
 def _mesh_findings(prim) -> Iterator[Finding]:
     path = str(prim.GetPath())
     try:
-        points, counts, indices = _topology(prim)
-        holes = value_of(prim, "holeIndices")
+        points, counts, indices, holes = _topology(prim)
     except InputError:  # reported with the attributes
         return
     if points is None or not len(points):
@@ -103,7 +101,7 @@ def _mesh_findings(prim) -> Iterator[Finding]:
 
 
 def _topology(prim) -> tuple:
-    return tuple(value_of(prim, name) for name in ("points", "faceVertexCounts", "faceVertexIndices"))
+    return tuple(value_of(prim, name) for name in ("points", "faceVertexCounts", "faceVertexIndices", "holeIndices"))
 
 
 def _topology_fault(vertices: int, counts, indices, holes) -> str:

@@ -11,24 +11,20 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
 from warpmag.declarations.rotations import conjugate, cross, multiply, rotate
-from warpmag.usd.read.prims import descendants, is_body, is_collider
+from warpmag.usd.read.prims import descendants, is_body, is_collider, lineage
 from warpmag.usd.read.transforms import is_animated, rotation_of
+from warpmag.usd.read.units import units_of
 from warpmag.usd.schemas import MAGNET_API
 
 COMPACT_COUNT = 5_000
 """Least number of instances that a run writes as an instancer: as prims, each would take 10 kB of memory."""
 MOMENTS_PRIMVAR = "primvars:warpmag:moment"
 """Moments of instances [A·m²], world frame."""
-INSTANCE_ARRAYS = {
-    "positions": 3,
-    "orientations": 4,
-    "velocities": 3,
-    "angularVelocities": 3,
-    MOMENTS_PRIMVAR: 3,
-}
+INSTANCE_ARRAYS = {"positions": 3, "orientations": 4, "velocities": 3, "angularVelocities": 3, MOMENTS_PRIMVAR: 3}
 """Arrays with one value for each instance, and the numbers in a value."""
 _SCHEMAS = {"PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI", "MaterialBindingAPI", MAGNET_API}
 """API schemas of a ball that can be copied: none refers to other prims, except for a material."""
+_REFERRING = (UsdPhysics.Joint, UsdPhysics.CollisionGroup)
 _SIMILARITY = 1e-6
 """Tolerance for rotation and uniform scale in a transform: rounding errors of single precision."""
 
@@ -37,25 +33,17 @@ _SIMILARITY = 1e-6
 class IdenticalBalls:
     """Instances of one instancer that differ only in the values of its arrays.
 
-    Attributes:
-        first: Path of the instance that has prims.
-        others: Paths of the other instances.
-        body: Path of the body below an instance.
-        rows: Rows of the instances in the arrays, ``first`` in front, shape [1 + n].
-        arrays: :data:`INSTANCE_ARRAYS` of these instances, shape [1 + n, ...]; quaternions (x, y, z, w). Empty where
-            the instancer has none.
-        stays_instancer: Whether a run writes the instancer as an instancer: it is large, and all its instances are
-            identical balls.
-        create_prims: Creates the prims of the other instances.
+    A run writes the instancer as an instancer, ``stays_instancer``, if it is large and all its instances are identical
+    balls.
     """
 
-    first: Sdf.Path
-    others: list[str]
-    body: Sdf.Path
-    rows: np.ndarray
-    arrays: dict[str, np.ndarray]
+    first: Sdf.Path  # of the instance that has prims
+    others: list[str]  # paths of the other instances
+    body: Sdf.Path  # of the body below an instance
+    rows: np.ndarray  # rows of the instances in the arrays, ``first`` in front, shape [1 + n]
+    arrays: dict[str, np.ndarray]  # ``INSTANCE_ARRAYS``, shape [1 + n, ...]; empty where the instancer has none
     stays_instancer: bool
-    create_prims: Callable[[], None]
+    create_prims: Callable[[], None] = lambda: None  # creates the prims of the other instances
 
     @property
     def instancer(self) -> Sdf.Path:
@@ -86,13 +74,10 @@ class BallFrames:
     """
 
     def __init__(self, stage: Usd.Stage, balls: IdenticalBalls, rotation: np.ndarray | None = None):
-        """Read the transforms of the instance that has prims.
+        """Read the transforms of the instance that has prims; the stage is in meters.
 
-        Args:
-            stage: The stage, in meters.
-            balls: Its instances.
-            rotation: Rotation of the first body in the world, such as Newton's, so that all bodies have its rounding;
-                by default the rotation in the stage.
+        ``rotation`` is the rotation of the first body in the world, such as Newton's, so that all bodies have its
+        rounding; by default the rotation in the stage.
         """
         transforms = UsdGeom.XformCache(Usd.TimeCode.Default())
         self.instancer = np.array(transforms.GetLocalToWorldTransform(stage.GetPrimAtPath(balls.instancer)))
@@ -119,10 +104,7 @@ class BallFrames:
     def velocities(self, arrays: dict[str, np.ndarray], first: np.ndarray | None = None) -> np.ndarray:
         """Return linear [m/s] and angular velocities [rad/s] of the bodies in the world, shape [n, 6].
 
-        Args:
-            arrays: Arrays of the instances.
-            first: Velocities of the first body, shape [6], by default zero. Where the arrays have none, the other
-                bodies have the same velocities in their own frames.
+        Where the arrays have none, all bodies have those of the ``first``, shape [6], in their own frames; else zero.
         """
         linear, angular = arrays["velocities"], np.radians(arrays["angularVelocities"])
         rotations = self._rotations(arrays)
@@ -141,12 +123,7 @@ class BallFrames:
         return velocities
 
     def instance_arrays(self, body_q: np.ndarray, body_qd: np.ndarray) -> dict[str, np.ndarray]:
-        """Return instance arrays of bodies, float64: the inverse of :meth:`poses` and :meth:`velocities`.
-
-        Args:
-            body_q: Position [m] and quaternion (x, y, z, w), shape [n, 7].
-            body_qd: Linear [m/s] and angular velocity [rad/s], shape [n, 6].
-        """
+        """Return instance arrays of bodies, float64: the inverse of :meth:`poses` and :meth:`velocities`."""
         # column-major arrays halve the time
         body_q, body_qd = (values.astype(float, order="F") for values in (body_q, body_qd))
         inverse = self._repeat(conjugate(self.instancer_rotation), body_q)
@@ -171,15 +148,54 @@ class BallFrames:
         return np.broadcast_to(value, (len(rows), len(value)))
 
 
-def has_interchangeable_instances(stage: Usd.Stage, instancer: UsdGeom.PointInstancer, time_code: float) -> bool:
+def rows_of(arrays: dict[str, np.ndarray], rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Return rows of arrays; empty arrays stay empty."""
+    return {name: values[rows] if len(values) else values for name, values in arrays.items()}
+
+
+def identical_balls(
+    instancer: UsdGeom.PointInstancer,
+    time_code: float,
+    paths: list[str],
+    rows: np.ndarray,
+    kinds: np.ndarray,
+    arrays: dict[str, np.ndarray],
+) -> Iterator[IdenticalBalls]:
+    """Yield groups of two or more identical balls of an instancer; none unless units are SI and arrays are finite.
+
+    Args:
+        instancer: The instancer.
+        time_code: Time code of the arrays.
+        paths: Paths of the instances.
+        rows: Row of each instance in the arrays.
+        kinds: Prototype and scale of each instance, shape [n, 1] or [n, 4].
+        arrays: Arrays of the instancer.
+    """
+    stage = instancer.GetPrim().GetStage()
+    finite = all(np.isfinite(values).all() for values in arrays.values())
+    if not (finite and units_of(stage).are_si and _has_interchangeable_instances(stage, instancer, time_code)):
+        return
+    targets = instancer.GetPrototypesRel().GetForwardedTargets()
+    bodies = [_ball_in(stage.GetPrimAtPath(target)) for target in targets]
+    _, labels = np.unique(kinds, axis=0, return_inverse=True)
+    order = np.argsort(labels.ravel(), kind="stable")
+    members = np.split(order, np.flatnonzero(np.diff(labels.ravel()[order])) + 1)
+    members = sorted(members, key=lambda group: group[0]) if len(order) else []
+    groups = [(bodies[int(kinds[group[0], 0])], group) for group in members]
+    stays = len(rows) >= COMPACT_COUNT and len(rows) == len(arrays["positions"])
+    stays = stays and all(body is not None and len(group) > 1 for body, group in groups)
+    stays = stays and _can_stay_instancer(instancer, time_code)
+    for body, group in groups:
+        if body is not None and len(group) > 1:
+            first, *others = (paths[row] for row in group.tolist())
+            yield IdenticalBalls(Sdf.Path(first), others, body, rows[group], rows_of(arrays, rows[group]), stays)
+
+
+def _has_interchangeable_instances(stage: Usd.Stage, instancer: UsdGeom.PointInstancer, time_code: float) -> bool:
     """Return whether no prim can refer to a single instance, and the scale of the instancer is uniform."""
     path = instancer.GetPath()
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
-        if (
-            prim.IsA(UsdPhysics.Joint)
-            or prim.IsA(UsdPhysics.CollisionGroup)
-            or prim.HasAPI(UsdPhysics.FilteredPairsAPI)
-        ):
+        if any(map(prim.IsA, _REFERRING)) or prim.HasAPI(UsdPhysics.FilteredPairsAPI):
             return False
         if prim.IsA(UsdGeom.PointInstancer) and prim.GetPath() != path:
             if any(map(path.HasPrefix, UsdGeom.PointInstancer(prim).GetPrototypesRel().GetForwardedTargets())):
@@ -191,11 +207,8 @@ def has_interchangeable_instances(stage: Usd.Stage, instancer: UsdGeom.PointInst
     return bool(scale > 0.0 and similar)
 
 
-def can_stay_instancer(instancer: UsdGeom.PointInstancer, time_code: float) -> bool:
-    """Return whether a run may write an instancer as an instancer.
-
-    Nothing else may move or scale it, and the scales and prototypes of its instances are constant.
-    """
+def _can_stay_instancer(instancer: UsdGeom.PointInstancer, time_code: float) -> bool:
+    """Return whether nothing else moves or scales an instancer, and scales and prototypes are constant."""
     prim = instancer.GetPrim()
     if instancer.GetAccelerationsAttr().HasAuthoredValue():
         return False
@@ -204,14 +217,10 @@ def can_stay_instancer(instancer: UsdGeom.PointInstancer, time_code: float) -> b
     world = np.array(UsdGeom.XformCache(Usd.TimeCode(time_code)).GetLocalToWorldTransform(prim))[:3, :3]
     if not np.allclose(world @ world.T, np.eye(3), rtol=0.0, atol=_SIMILARITY):
         return False
-    while prim and not prim.IsPseudoRoot():
-        if is_animated(prim) or is_body(prim) or prim.IsInstance():
-            return False
-        prim = prim.GetParent()
-    return True
+    return not any(is_animated(parent) or is_body(parent) or parent.IsInstance() for parent in lineage(prim))
 
 
-def ball_in(prototype: Usd.Prim) -> Sdf.Path | None:
+def _ball_in(prototype: Usd.Prim) -> Sdf.Path | None:
     """Return the path of a prototype's body below the instance; None unless its only content is one dynamic ball."""
     prims = list(descendants(prototype))
     bodies = [prim for prim in prims if is_body(prim)]
@@ -230,33 +239,3 @@ def _can_be_copied(prim: Usd.Prim) -> bool:
     schemas = prim.GetPrimTypeInfo().GetAppliedAPISchemas()
     sampled = any(attribute.GetNumTimeSamples() or attribute.HasSpline() for attribute in prim.GetAttributes())
     return _SCHEMAS.issuperset(schemas) and not sampled and not prim.IsInstanceProxy() and not prim.IsInstance()
-
-
-def _do_nothing() -> None:
-    """Default of ``IdenticalBalls.create_prims``, which the caller replaces."""
-
-
-def group_identical(
-    paths: list[str], rows: np.ndarray, kinds: np.ndarray, arrays: dict[str, np.ndarray], balls: dict[int, Sdf.Path]
-) -> Iterator[IdenticalBalls]:
-    """Yield groups of two or more identical balls.
-
-    Args:
-        paths: Paths of instances.
-        rows: Row of each instance in the arrays.
-        kinds: Prototype and scale of each instance, shape [n, 1] or [n, 4].
-        arrays: Arrays of the instancer.
-        balls: Path of the body below an instance, for each prototype that is a ball.
-    """
-    _, labels = np.unique(kinds, axis=0, return_inverse=True)
-    order = np.argsort(labels.ravel(), kind="stable")
-    members = np.split(order, np.flatnonzero(np.diff(labels.ravel()[order])) + 1)
-    members = sorted(members, key=lambda group: group[0]) if len(order) else []
-    groups = [(int(kinds[group[0], 0]), group) for group in members]
-    compact = len(rows) >= COMPACT_COUNT and len(rows) == len(arrays["positions"])
-    compact = compact and all(prototype in balls and len(group) > 1 for prototype, group in groups)
-    for prototype, group in groups:
-        if prototype in balls and len(group) > 1:
-            values = {name: array[rows[group]] if len(array) else array for name, array in arrays.items()}
-            first, *others = (paths[row] for row in group.tolist())
-            yield IdenticalBalls(Sdf.Path(first), others, balls[prototype], rows[group], values, compact, _do_nothing)

@@ -31,9 +31,7 @@ _REPORTED = "Custom attribute '"
 def newton_errors(stage_name: str, action: str) -> Iterator[None]:
     """Raise :class:`InputError` for every exception in the block, and for warnings about content that is left out.
 
-    Args:
-        stage_name: Name of the stage in messages.
-        action: Verb for what Newton does with the stage in the block.
+    ``action`` is the verb for what Newton does with the stage.
     """
     try:
         with quiet(), _logged_warnings() as logged, warnings.catch_warnings(record=True) as caught:
@@ -72,9 +70,7 @@ def _logged_warnings() -> Iterator[list[str]]:
 def usd_errors(stage_name: str, otherwise: str = "USD cannot read it") -> Iterator[None]:
     """Raise :class:`InputError` for exceptions of USD in the block, and keep USD's messages off stderr.
 
-    Args:
-        stage_name: Name of the stage in messages.
-        otherwise: Message for such an exception; USD's own follows in brackets.
+    Its message is ``otherwise``, followed by USD's own in brackets.
     """
     try:
         with quiet():

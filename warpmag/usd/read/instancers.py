@@ -13,19 +13,10 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
 from warpmag.errors import InputError
-from warpmag.usd.read.identical_balls import (
-    INSTANCE_ARRAYS,
-    MOMENTS_PRIMVAR,
-    IdenticalBalls,
-    ball_in,
-    can_stay_instancer,
-    group_identical,
-    has_interchangeable_instances,
-)
+from warpmag.usd.read.identical_balls import INSTANCE_ARRAYS, MOMENTS_PRIMVAR, IdenticalBalls, identical_balls
 from warpmag.usd.read.prims import descendants, is_body, is_collider, is_physical
 from warpmag.usd.read.session import INSTANCES, add_layer, new_layer, release, release_instances
 from warpmag.usd.read.trial_read import MOST_PRIMS
-from warpmag.usd.read.units import units_of
 from warpmag.usd.schemas import MAGNET_API, MOMENT, has_api
 
 _TYPES = Sdf.ValueTypeNames
@@ -46,14 +37,8 @@ _LENGTH_ERROR = 0.01
 def expand_instancers(stage: Usd.Stage, time_code: float, *, defer: bool = False) -> list[IdenticalBalls]:
     """Create prims for the instances of physical prims, in a layer of the stage's session.
 
-    Args:
-        stage: The stage.
-        time_code: The time code whose positions the instances take. Instances whose motion a run follows keep all their
-            time samples.
-        defer: Create prims only for the first of identical balls.
-
-    Returns:
-        The deferred instances, whose prims :func:`complete_instances` creates.
+    Instances take their positions at the time code. Those whose motion a run follows keep all their time samples. With
+    ``defer`` only the first of identical balls gets prims; the rest is returned for :func:`complete_instances`.
 
     Raises:
         InputError: An instancer breaks USD's rules or expands to too many prims.
@@ -74,23 +59,14 @@ def complete_instances(deferred: list[IdenticalBalls]) -> None:
 
 @dataclass(frozen=True)
 class _Prototype:
-    """A prototype of instances.
+    """A prototype of instances."""
 
-    Attributes:
-        path: Path of its root.
-        name: Name of its root.
-        order: Transform operations of its root without the reset of the transform stack, None if it has no reset.
-        bodies: Rigid bodies in it: path below the root, and transform relative to the root's parent.
-        magnets: Paths of the magnets in it, below the root.
-        prims: Number of its prims.
-    """
-
-    path: Sdf.Path
-    name: str
-    order: list[str] | None
-    bodies: tuple[tuple[Sdf.Path, Gf.Matrix4d], ...]
-    magnets: tuple[Sdf.Path, ...]
-    prims: int
+    path: Sdf.Path  # of its root
+    name: str  # of its root
+    order: list[str] | None  # transform operations of its root without the reset of the stack, None if it has no reset
+    bodies: tuple[tuple[Sdf.Path, Gf.Matrix4d], ...]  # path below the root, and transform relative to the root's parent
+    magnets: tuple[Sdf.Path, ...]  # paths of the magnets in it, below the root
+    prims: int  # number of its prims
 
 
 class _Expansion:
@@ -146,18 +122,18 @@ class _Expansion:
         """Write the prims of an instancer's instances, except for deferred ones."""
         path, layer = instancer.GetPath(), self._layer_of_prims()
         instances = _Instances(instancer, len(targets), self._time)
-        if any(
-            len(instances.arrays[name]) for name in _VELOCITIES
-        ):  # they are written to the bodies, also inside instances
-            for target in targets:
-                release_instances(self._stage, layer, target)
+        has_velocities = any(len(instances.arrays[name]) for name in _VELOCITIES)
+        for target in targets if has_velocities else ():  # they are written to the bodies, also inside instances
+            release_instances(self._stage, layer, target)
         prototypes = [_prototype(self._stage.GetPrimAtPath(target)) for target in targets]
         samples = instances.samples() if any(map(self._follows_keys, targets)) else ()
         prefix = _NAME
         while any(name.startswith(prefix) for name in instancer.GetPrim().GetAllChildrenNames()):
             prefix += "_"
         write = partial(_write_instances, layer, path, prefix, instances, prototypes, samples)
-        groups = self._identical(instancer, instances, prefix) if self._defer and not samples else []
+        groups = []
+        if self._defer and not samples:
+            groups = list(identical_balls(instancer, self._time, *instances.kinds(f"{path}/{prefix}")))
         without_prims = {row for balls in groups if balls.stays_instancer for row in balls.rows.tolist()}
         self._prims += sum(
             1 + prototypes[instances.prototypes[row]].prims for row in instances.rows if row not in without_prims
@@ -177,22 +153,6 @@ class _Expansion:
         deferred = {row for rows in later for row in rows}
         write([row for row in instances.rows if row not in deferred])
 
-    def _identical(
-        self, instancer: UsdGeom.PointInstancer, instances: "_Instances", prefix: str
-    ) -> list[IdenticalBalls]:
-        """Return the identical balls of an instancer; none unless units are SI and all arrays are finite."""
-        finite = all(np.isfinite(values).all() for values in instances.arrays.values())
-        is_si = units_of(self._stage).are_si
-        if not (finite and is_si and has_interchangeable_instances(self._stage, instancer, self._time)):
-            return []
-        targets = instancer.GetPrototypesRel().GetForwardedTargets()
-        bodies = [ball_in(self._stage.GetPrimAtPath(target)) for target in targets]
-        balls = {number: body for number, body in enumerate(bodies) if body is not None}
-        groups = list(group_identical(*instances.kinds(f"{instancer.GetPath()}/{prefix}"), instances.arrays, balls))
-        if not can_stay_instancer(instancer, self._time):
-            groups = [replace(group, stays_instancer=False) for group in groups]
-        return groups
-
     def _follows_keys(self, target: Sdf.Path) -> bool:
         """Return whether a prototype has kinematic bodies or colliders without a body, which follow the instance."""
         dynamic = False
@@ -207,13 +167,7 @@ class _Expansion:
 
 
 class _Instances:
-    """Arrays of an instancer at one time code.
-
-    Attributes:
-        rows: Rows of the active instances.
-        prototypes: Number of each instance's prototype, shape [n].
-        arrays: :data:`warpmag.usd.read.identical_balls.INSTANCE_ARRAYS`; empty where the instancer has none.
-    """
+    """Arrays of an instancer at one time code; ``arrays`` are :data:`INSTANCE_ARRAYS`, empty where it has none."""
 
     def __init__(self, instancer: UsdGeom.PointInstancer, prototypes: int, time_code: float):
         """Read the arrays; raises :class:`InputError` where their lengths or types are inconsistent."""
@@ -232,18 +186,19 @@ class _Instances:
         ids = self._array("ids", time, None)
         metadata = self._prim.GetMetadata("inactiveIds")
         inactive = set(metadata.GetAppliedItems() if metadata else ())
-        self.rows = [row for row in range(self._count) if (int(ids[row]) if len(ids) else row) not in inactive]
+        active = [(int(ids[row]) if len(ids) else row) not in inactive for row in range(self._count)]
+        self.rows = np.flatnonzero(active).tolist()
 
     def value(self, name: str, row: int):
         """Return an instance's value of an array, None where the array is empty."""
         values = self._scales if name == "scales" else self.arrays[name]
         return _typed(name, values[row]) if len(values) else None
 
-    def kinds(self, prefix: str) -> tuple[list[str], np.ndarray, np.ndarray]:
-        """Return paths, rows and kinds of the active instances, as :func:`group_identical` takes them."""
+    def kinds(self, prefix: str) -> tuple[list[str], np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Return paths, rows and kinds of the active instances, and all arrays, as for :func:`identical_balls`."""
         rows = np.array(self.rows, int)
         kinds = np.c_[self.prototypes, self._scales] if len(self._scales) else self.prototypes[:, None]
-        return [f"{prefix}{row}" for row in self.rows], rows, kinds[rows]
+        return [f"{prefix}{row}" for row in self.rows], rows, kinds[rows], self.arrays
 
     def samples(self) -> tuple[tuple[float, dict[str, np.ndarray]], ...]:
         """Return the arrays of the instances' transforms at all time samples; empty for fewer than two samples."""

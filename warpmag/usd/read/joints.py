@@ -27,34 +27,24 @@ _SELF_COLLISION = "newton:selfCollisionEnabled"
 
 @dataclass(frozen=True)
 class GroundedJoint:
-    """A joint between a dynamic body and a fixed end.
-
-    Attributes:
-        path: Path of the joint.
-        position: Position of the joint's frame at the fixed end [m], world frame.
-        rotation: Rotation of that frame, a quaternion (x, y, z, w).
-        fixed: Path of the fixed prim, such as a collider or a kinematic body; empty for the world itself.
-        moving: Path of the dynamic body.
-        reversed: Whether the dynamic body is ``body0``: the joint's coordinates then have the opposite sign.
-        collides: Whether the body and the fixed prim may collide.
-    """
+    """A joint between a dynamic body and a fixed end."""
 
     path: str
-    position: tuple[float, float, float]
-    rotation: tuple[float, float, float, float]
-    fixed: str
-    moving: str
-    reversed: bool
-    collides: bool
+    position: tuple[float, float, float]  # of the joint's frame at the fixed end [m], world frame
+    rotation: tuple[float, float, float, float]  # of that frame, a quaternion (x, y, z, w)
+    fixed: str  # path of the fixed prim, such as a collider or a kinematic body; empty for the world itself
+    moving: str  # path of the dynamic body
+    reversed: bool  # True if the dynamic body is ``body0``: the joint's coordinates then have the opposite sign
+    collides: bool  # True if the body and the fixed prim may collide
 
 
 @dataclass(frozen=True)
 class _End:
-    """One end of a joint: its prim, the rigid body that carries the prim, and whether that body is dynamic."""
+    """One end of a joint."""
 
     prim: Usd.Prim | None
-    body: Usd.Prim | None
-    moves: bool
+    body: Usd.Prim | None  # the rigid body that carries the prim
+    moves: bool  # True if that body is dynamic
 
 
 def joint_findings(stage: Usd.Stage, keyed: Container[str] = ()) -> Iterator[Finding]:
@@ -127,12 +117,9 @@ def prepare_joints(stage: Usd.Stage, *, articulations: bool = True) -> list[Grou
     """Rewrite joints that Newton would misread, in the stage's session layer.
 
     Joints with a kinematic ``body1`` are attached to the world, joints between two fixed ends are disabled, and the
-    unlimited axes of a generic joint get explicit infinite limits.
-
-    Args:
-        stage: The stage.
-        articulations: Keep articulations, for solvers in generalized coordinates. Newton accepts only trees from
-            parent to child that contain all their bodies; without articulations it accepts any graph of joints.
+    unlimited axes of a generic joint get explicit infinite limits. Solvers in generalized coordinates need
+    ``articulations``: Newton then accepts only trees from parent to child that contain all their bodies, without them
+    any graph of joints.
 
     Returns:
         The joints between a dynamic body and a fixed end, except for kinematic bodies as ``body0``.
@@ -183,9 +170,8 @@ def _editable(stage: Usd.Stage, path: Sdf.Path) -> Usd.Prim:
 
 def _free_axes(joint: Usd.Prim) -> list[str]:
     """Return the axes without limits of a generic joint, which USD leaves free and Newton would lock."""
-    if joint.GetTypeName() != "PhysicsJoint":
-        return []
-    return [axis for axis in _AXES if not joint.HasAPI(UsdPhysics.LimitAPI, axis)]
+    axes = _AXES if joint.GetTypeName() == "PhysicsJoint" else ()
+    return [axis for axis in axes if not joint.HasAPI(UsdPhysics.LimitAPI, axis)]
 
 
 def _problem(stage: Usd.Stage, joint: UsdPhysics.Joint) -> str:

@@ -15,14 +15,11 @@ from warpmag.declarations.keys import Keys, Motion, Operation
 from warpmag.declarations.magnets import Magnet
 from warpmag.declarations.schemas import MAGNET_SCHEMA, SCENE_SCHEMA
 from warpmag.errors import InputError
-from warpmag.usd.read.prims import is_body, is_collider
+from warpmag.usd.read.prims import is_body, is_collider, lineage
 from warpmag.usd.read.session import without_frozen
-from warpmag.usd.read.transforms import is_animated
+from warpmag.usd.read.transforms import SCALE_TOLERANCE, is_animated, rigid_fault
 from warpmag.usd.schemas import MATERIAL, finite_vector
-from warpmag.usd.values import LARGEST_COORDINATE, Finding, instance_finding
-
-_SCALE_TOLERANCE = 1e-5
-"""Relative tolerance for constant scale and right angles of axes: poses are often in single precision."""
+from warpmag.usd.values import Finding, instance_finding
 
 
 class KeyReader:
@@ -40,44 +37,33 @@ class KeyReader:
 
     def moves(self, prim: Usd.Prim, within: Usd.Prim | None = None) -> bool:
         """Return whether keys move a prim or a parent, in the world or relative to the parent ``within``."""
-        while prim and not prim.IsPseudoRoot() and prim != within:
-            path = prim.GetPath()
+        for parent in lineage(prim):
+            if parent == within:
+                return False
+            path = parent.GetPath()
             if path not in self._moving:
-                self._moving[path] = is_animated(prim) and self._varies(path)
+                self._moving[path] = is_animated(parent) and self._varies(path)
             if self._moving[path]:
                 return True
-            if prim.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(prim).GetResetXformStack():
+            if parent.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(parent).GetResetXformStack():
                 return False
-            prim = prim.GetParent()
         return False
 
     def motion(self, prim: Usd.Prim) -> Motion:
-        """Return the keyed transform operations of a prim and its parents, at time codes of the stage.
-
-        Raises:
-            InputError: A sample is missing, not finite, or cannot be composed by USD.
-        """
+        """Return the keyed transform operations of a prim and its parents, at time codes of the stage."""
         operations: list[Operation] = []
-        prim = self.plain.GetPrimAtPath(prim.GetPath())
-        while prim and not prim.IsPseudoRoot():
-            if prim.IsA(UsdGeom.Xformable):
-                xform = UsdGeom.Xformable(prim)
+        for parent in lineage(self.plain.GetPrimAtPath(prim.GetPath())):
+            if parent.IsA(UsdGeom.Xformable):
+                xform = UsdGeom.Xformable(parent)
                 operations = [*_without_identities([_operation(op) for op in xform.GetOrderedXformOps()]), *operations]
                 if xform.GetResetXformStack():
                     break
-            prim = prim.GetParent()
         return Motion(tuple(operations))
 
     def keys(self, prim: Usd.Prim, name: str, read: Callable[[str, object], tuple]) -> Keys | None:
         """Return the time samples of an attribute, None where it has fewer than two.
 
-        Args:
-            prim: The prim.
-            name: The attribute.
-            read: Function of the name in messages and a value; checks the value and returns its numbers.
-
-        Raises:
-            InputError: A sample is invalid.
+        ``read`` is a function of the name in messages and a value. It checks the value and returns its numbers.
         """
         attribute = self.plain.GetPrimAtPath(prim.GetPath()).GetAttribute(name)
         times = attribute.GetTimeSamples() if attribute else ()
@@ -95,12 +81,12 @@ class KeyReader:
         for time in times.tolist():
             transforms.SetTime(time)
             world = np.array(transforms.GetLocalToWorldTransform(prim))
-            if message := _fault(world):
-                yield Finding(path, f"keyed transform {message} at time code {time:g}")
+            if fault := rigid_fault(world)[0]:
+                yield Finding(path, f"keyed transform {fault} at time code {time:g}")
                 return
             scale = np.linalg.norm(world[:3, :3], axis=1)
             scales = scale if scales is None else scales
-            if np.abs(scale - scales).max() > _SCALE_TOLERANCE * scales.max():
+            if np.abs(scale - scales).max() > SCALE_TOLERANCE * scales.max():
                 yield Finding(path, "its scale is keyed, and a rigid body keeps its size")
                 return
 
@@ -120,25 +106,21 @@ def make_kinematic(
 ) -> None:
     """Make animated colliders and field sources without a rigid body kinematic bodies, in the session layer.
 
-    Args:
-        stage: The stage.
-        animated: Prims whose own transforms have time samples.
-        is_source: Function that returns whether a prim is a coil or a field map.
+    ``animated`` are prims whose own transforms have time samples. ``is_source`` returns True for coils and field maps.
     """
     roots = [path for path in Sdf.Path.RemoveDescendentPaths(list(animated)) if stage.GetPrimAtPath(path)]
     reader, paths = KeyReader(stage), []
     for root in roots:
         for prim in Usd.PrimRange(stage.GetPrimAtPath(root), Usd.TraverseInstanceProxies()):
             chosen = is_collider(prim) or (prim.IsA(UsdGeom.Xformable) and is_source(prim))
-            if chosen and not _belongs(prim, paths) and reader.moves(prim):
+            has_body = chosen and any(is_body(parent) or parent.GetPath() in paths for parent in lineage(prim))
+            if chosen and not has_body and reader.moves(prim):
                 paths.append(prim.GetPath())
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         for path in paths:
-            prim = instance = stage.GetPrimAtPath(path)
-            while not instance.IsPseudoRoot() and not instance.IsInstance():
-                instance = instance.GetParent()
+            prim = stage.GetPrimAtPath(path)
             if prim.IsInstanceProxy():
-                where = instance.GetPath()
+                where = next(parent.GetPath() for parent in lineage(prim) if parent.IsInstance())
                 raise InputError(f"{path}: moves by keys inside an instance: set instanceable = false on {where}")
             body = UsdPhysics.RigidBodyAPI.Apply(prim)
             body.CreateRigidBodyEnabledAttr(True)
@@ -149,15 +131,6 @@ def make_kinematic(
             mass.CreateDiagonalInertiaAttr(Gf.Vec3f(1.0))
             mass.CreatePrincipalAxesAttr(Gf.Quatf(1.0))
             mass.CreateCenterOfMassAttr(Gf.Vec3f(0.0))
-
-
-def _belongs(prim: Usd.Prim, bodies: list[Sdf.Path]) -> bool:
-    """Return whether a prim is at or below a rigid body or one of the future ``bodies``."""
-    while prim and not prim.IsPseudoRoot():
-        if is_body(prim) or prim.GetPath() in bodies:
-            return True
-        prim = prim.GetParent()
-    return False
 
 
 def _sample(attribute: Usd.Attribute, time: float):
@@ -221,22 +194,6 @@ def _without_identities(operations: list[Operation]) -> list[Operation]:
         return neutral is not None and bool((operation.keys.values == neutral).all())
 
     return [operation for operation in operations if not is_identity(operation)]
-
-
-def _fault(world: np.ndarray) -> str:
-    """Return the reason why a rigid body cannot have a transform, empty where it can."""
-    matrix = world[:3, :3]
-    if not np.isfinite(world).all() or not np.abs(world).max() <= LARGEST_COORDINATE:
-        return f"reaches beyond {LARGEST_COORDINATE:g}"
-    gram = matrix @ matrix.T
-    size = np.trace(gram) / 3.0
-    if np.linalg.norm(matrix, axis=1).min() < 1.0 / LARGEST_COORDINATE:
-        return f"has a scale of less than {1.0 / LARGEST_COORDINATE:g}"
-    if np.abs(gram - np.diag(np.diag(gram))).max() > _SCALE_TOLERANCE * size:
-        return "is sheared"
-    if np.abs(world[:, 3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
-        return "is a projection"
-    return "is mirrored" if np.linalg.det(matrix) < 0.0 else ""
 
 
 def field_keys(prim: Usd.Prim, keys: KeyReader) -> Keys | None:

@@ -32,10 +32,6 @@ def give_densities(stage: Usd.Stage, magnets: Iterable[str]) -> None:
 
     A mass or density of the collider, of its rigid body or of its bound physics material takes precedence. The density
     is written to the session layer, from which Newton reads it.
-
-    Args:
-        stage: A stage from ``open_stage``.
-        magnets: Paths of the magnets.
     """
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         for path in magnets:

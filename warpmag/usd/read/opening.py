@@ -55,11 +55,7 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
 
 
 def open_deferred(path: str | os.PathLike, time_code: float | None = None) -> tuple[Usd.Stage, list[IdenticalBalls]]:
-    """Open a stage like :func:`open_stage`, with prims only for the first of identical balls.
-
-    Returns:
-        The stage, and the instances whose prims :func:`complete_instances` creates.
-    """
+    """Open a stage like :func:`open_stage`, but leave prims of identical balls to :func:`complete_instances`."""
     file = _existing(path)
     if reason := trial_read(full_path(file)):
         raise InputError(f"{path}: {reason}")
@@ -73,15 +69,9 @@ def open_deferred(path: str | os.PathLike, time_code: float | None = None) -> tu
 
 
 def open_animated(path: str | os.PathLike) -> tuple[Usd.Stage, list[BallInstancer]]:
-    """Open a stage with its time samples, in its own units.
+    """Open a stage with its time samples, in its own units; return it with the instancers whose balls have no prims.
 
     There is no trial read in a child process: for a long run it would take longer than the export.
-
-    Returns:
-        The stage with prims for each instance of a body, and the instancers whose balls have no prims.
-
-    Raises:
-        InputError: The file is missing, is not USD, does not compose, or has invalid instancers.
     """
     stage = _open(_existing(path), path)
     with usd_errors(str(path)):
@@ -129,10 +119,6 @@ def freeze(stage: Usd.Stage, time_code: float) -> None:
     instances cannot be frozen; :func:`warpmag.usd.survey` reports those that matter. USD ignores time samples of the
     order of transform operations, so that order stays. Network addresses are blocked. Animated colliders without a
     rigid body become kinematic bodies.
-
-    Raises:
-        InputError: Time samples have another type than their attribute, an address cannot be blocked, or an animated
-            prim cannot become a body.
     """
     session = stage.GetSessionLayer()
     candidates = [
@@ -179,13 +165,7 @@ def _value_at(attribute, time_code):
 
 
 def _block_addresses(stage: Usd.Stage) -> None:
-    """Block shader inputs with network addresses, in the session layer; ``warpmag check`` warns of them.
-
-    Newton would fetch a texture from any address in a shader.
-
-    Raises:
-        InputError: An input lies inside an instance, where it cannot be blocked.
-    """
+    """Block shader inputs with network addresses, from which Newton would fetch textures, in the session layer."""
     addresses = list(_addresses(stage))
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         for attribute, address in addresses:

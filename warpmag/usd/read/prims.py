@@ -38,11 +38,14 @@ def has_volume(stage: Usd.Stage, body: str) -> bool:
 
 def body_of(prim: Usd.Prim) -> Usd.Prim | None:
     """Return the nearest rigid body at or above a prim, None where there is none."""
+    return next(filter(is_body, lineage(prim)), None)
+
+
+def lineage(prim: Usd.Prim) -> Iterator[Usd.Prim]:
+    """Yield a prim and its parents up to the root of the stage, which is left out."""
     while prim and not prim.IsPseudoRoot():
-        if is_body(prim):
-            return prim
+        yield prim
         prim = prim.GetParent()
-    return None
 
 
 def descendants(prim: Usd.Prim) -> Iterator[Usd.Prim]:
@@ -51,15 +54,13 @@ def descendants(prim: Usd.Prim) -> Iterator[Usd.Prim]:
 
 
 def prims_of_magnet(prim: Usd.Prim) -> Iterator[Usd.Prim]:
-    """Yield the prims that a magnet at ``prim`` may cover: all that move with a body, or a collider alone."""
-    return _prims_of_body(prim) if is_body(prim) else iter((prim,))
-
-
-def _prims_of_body(body: Usd.Prim) -> Iterator[Usd.Prim]:
-    """Yield the prims that move with ``body``: its subtree without nested bodies."""
-    prims = iter(Usd.PrimRange(body, Usd.TraverseInstanceProxies()))
-    for prim in prims:
-        if prim != body and is_body(prim):
+    """Yield the prims that a magnet at ``prim`` may cover: a body's subtree without nested bodies, or a collider."""
+    if not is_body(prim):
+        yield prim
+        return
+    prims = iter(Usd.PrimRange(prim, Usd.TraverseInstanceProxies()))
+    for part in prims:
+        if part != prim and is_body(part):
             prims.PruneChildren()
         else:
-            yield prim
+            yield part

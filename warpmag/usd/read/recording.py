@@ -11,7 +11,7 @@ from warpmag.declarations.rotations import multiply, rotate
 from warpmag.usd.read.ball_instancers import BallInstancer
 from warpmag.usd.read.identical_balls import MOMENTS_PRIMVAR
 from warpmag.usd.read.opening import freeze
-from warpmag.usd.read.prims import is_body
+from warpmag.usd.read.prims import is_body, lineage
 from warpmag.usd.read.transforms import is_animated, rigid_part, rotation_of
 from warpmag.usd.schemas import MAGNET_API, MOMENT, SCENE_API, has_api
 
@@ -22,43 +22,26 @@ _VELOCITIES = "physics:velocity", "physics:angularVelocity"
 
 @dataclass(frozen=True)
 class Recording:
-    """Bodies and magnets of a stage over time, in the world, in the stage's unit of length.
+    """Bodies and magnets of a stage over time, in the world, in the stage's unit of length."""
 
-    Attributes:
-        codes: Time codes of the samples, shape [f]; only the start of the stage where nothing moves.
-        seconds: Times of the samples since the first one [s], shape [f].
-        meters_per_unit: The stage's unit of length [m].
-        bodies: Paths of the rigid bodies.
-        positions: Their origins, float64, shape [f, n, 3].
-        rotations: Their orientations, quaternions (x, y, z, w), float32, shape [f, n, 4].
-        linear: Their velocities [units/s], float32, shape [f, n, 3].
-        angular: Their angular velocities [rad/s], float32, shape [f, n, 3].
-        magnets: Paths of the magnets that have moments.
-        moments: Their moments [A·m²], float32, shape [f, m, 3].
-        permanent: Whether each magnet is permanent, shape [m].
-        external: The external field [A/m], shape [f, 3].
-    """
-
-    codes: np.ndarray
-    seconds: np.ndarray
-    meters_per_unit: float
-    bodies: list[str]
-    positions: np.ndarray
-    rotations: np.ndarray
-    linear: np.ndarray
-    angular: np.ndarray
-    magnets: list[str]
-    moments: np.ndarray
-    permanent: np.ndarray
-    external: np.ndarray
+    codes: np.ndarray  # time codes of the samples, shape [f]; only the start of the stage where nothing moves
+    seconds: np.ndarray  # times of the samples since the first one [s], shape [f]
+    meters_per_unit: float  # the stage's unit of length [m]
+    bodies: list[str]  # paths of the rigid bodies
+    positions: np.ndarray  # origins of the bodies, float64, shape [f, n, 3]
+    rotations: np.ndarray  # orientations of the bodies, quaternions (x, y, z, w), float32, shape [f, n, 4]
+    linear: np.ndarray  # velocities of the bodies [units/s], float32, shape [f, n, 3]
+    angular: np.ndarray  # angular velocities of the bodies [rad/s], float32, shape [f, n, 3]
+    magnets: list[str]  # paths of the magnets that have moments
+    moments: np.ndarray  # moments of the magnets [A·m²], float32, shape [f, m, 3]
+    permanent: np.ndarray  # True for each permanent magnet, shape [m]
+    external: np.ndarray  # the external field [A/m], shape [f, 3]
 
 
 def read_recording(stage: Usd.Stage, instancers: Sequence[BallInstancer] = ()) -> Recording:
-    """Read a stage at all time samples of its bodies and moments.
+    """Read a stage that is not frozen at all time samples of its bodies and moments.
 
-    Args:
-        stage: The stage, with its time samples not overridden by :func:`freeze`.
-        instancers: Instancers whose balls have no prims; their balls follow the bodies and magnets with prims.
+    The balls of ``instancers``, which have no prims, follow the bodies and magnets with prims.
     """
     prims = [prim for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()) if prim.IsActive()]
     firsts = [balls.first for instancer in instancers for balls in instancer.groups]
@@ -135,12 +118,8 @@ def _with_balls(recording: Recording, instancer: BallInstancer) -> Recording:
 
 def _codes(stage, bodies, magnets, instancers) -> np.ndarray:
     """Return all time codes at which a body or a moment has a sample, in order."""
-    samples: set[tuple[float, ...]] = set()
-    for prim in bodies:
-        while prim and not prim.IsPseudoRoot():
-            if prim.IsA(UsdGeom.Xformable):
-                samples.add(tuple(UsdGeom.Xformable(prim).GetTimeSamples()))
-            prim = prim.GetParent()
+    xforms = (prim for body in bodies for prim in lineage(body) if prim.IsA(UsdGeom.Xformable))
+    samples = {tuple(UsdGeom.Xformable(prim).GetTimeSamples()) for prim in xforms}
     samples |= {tuple(prim.GetAttribute(MOMENT).GetTimeSamples()) for prim in magnets}
     positions = [stage.GetPrimAtPath(instancer.path).GetAttribute("positions") for instancer in instancers]
     samples |= {tuple(attribute.GetTimeSamples()) for attribute in positions}
@@ -161,7 +140,7 @@ class _Poses:
         order = list(UsdGeom.Xformable(prim).GetXformOpOrderAttr().Get() or ())
         resets = order[:1] == ["!resetXformStack!"]
         if order[resets:] not in ([TRANSLATE, ORIENT], [TRANSLATE, ORIENT, SCALE]) or not (
-            resets or self._parents_are_still(prim)
+            resets or _parents_are_still(prim)
         ):
             return self._composed(prim)
         positions = _values(prim.GetAttribute(TRANSLATE), self._codes, Vt.Vec3dArray)
@@ -172,16 +151,8 @@ class _Poses:
             rotations = multiply(np.broadcast_to(rotation_of(parent), rotations.shape), rotations).astype(np.float32)
         return positions, rotations
 
-    def _parents_are_still(self, prim) -> bool:
-        parent = prim.GetParent()
-        while parent and not parent.IsPseudoRoot():
-            if is_animated(parent):
-                return False
-            parent = parent.GetParent()
-        return True
-
     def _composed(self, prim) -> tuple[np.ndarray, np.ndarray]:
-        moves = is_animated(prim) or not self._parents_are_still(prim)
+        moves = is_animated(prim) or not _parents_are_still(prim)
         if moves and not self._caches:
             self._caches = [UsdGeom.XformCache(code) for code in self._codes]
         caches = self._caches if moves else [self._first]
@@ -192,6 +163,10 @@ class _Poses:
             rotations[k] *= -1.0 if rotations[k] @ rotations[k - 1] < 0.0 else 1.0
         count = len(self._codes)
         return np.broadcast_to(positions, (count, 3)), np.broadcast_to(rotations, (count, 4)).astype(np.float32)
+
+
+def _parents_are_still(prim: Usd.Prim) -> bool:
+    return not any(map(is_animated, lineage(prim.GetParent())))
 
 
 def _values(attribute: Usd.Attribute | None, codes: np.ndarray, array) -> np.ndarray:
@@ -238,9 +213,6 @@ class Playback:
             values = values if len(values) else np.zeros((len(instancer.bodies), 3))
             balls |= zip(instancer.magnets, values, strict=True)
         for row, prim in zip(moments, prims, strict=True):
-            if prim in balls:
-                row[:] = balls[prim]
-                continue
-            value = self._stage.GetPrimAtPath(prim).GetAttribute(MOMENT).Get()
+            value = balls[prim] if prim in balls else self._stage.GetPrimAtPath(prim).GetAttribute(MOMENT).Get()
             row[:] = 0.0 if value is None else value
         return moments

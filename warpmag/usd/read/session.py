@@ -37,11 +37,7 @@ def added_layer(stage: Usd.Stage, name: str) -> Sdf.Layer | None:
 
 
 def release_instances(stage: Usd.Stage, layer: Sdf.Layer, within: Sdf.Path) -> None:
-    """Make all instances below a prim editable, nested ones included, by opinions in ``layer``.
-
-    Raises:
-        InputError: A physical instance would change by that.
-    """
+    """Make all instances below a prim editable, nested ones included, see :func:`release`."""
     while True:
         prims = Usd.PrimRange(stage.GetPrimAtPath(within), Usd.PrimAllPrimsPredicate)
         instances = [prim.GetPath() for prim in prims if prim.IsInstance()]
@@ -51,11 +47,7 @@ def release_instances(stage: Usd.Stage, layer: Sdf.Layer, within: Sdf.Path) -> N
 
 
 def release(stage: Usd.Stage, layer: Sdf.Layer, instances: list[Sdf.Path]) -> None:
-    """Make instances editable, by opinions ``instanceable = false`` in ``layer``.
-
-    Raises:
-        InputError: A physical instance may change by that.
-    """
+    """Make instances editable, by opinions in ``layer``; raise :class:`InputError` if a physical one may change."""
     with Sdf.ChangeBlock():
         for path in instances:
             Sdf.CreatePrimInLayer(layer, path).instanceable = False

@@ -24,46 +24,25 @@ from warpmag.usd.read.prims import body_of, is_body, is_collider, is_solid, prim
 from warpmag.usd.read.session import instance_findings, instances_around, unsaved_layers
 from warpmag.usd.read.transforms import TransformCheck
 from warpmag.usd.read.unused_attributes import kind_findings, stray_findings
-from warpmag.usd.schemas import (
-    MAGNET_API,
-    SCENE_API,
-    has_api,
-    magnet_of,
-    moment_of,
-    settings_of,
-)
+from warpmag.usd.schemas import MAGNET_API, SCENE_API, has_api, magnet_of, moment_of, settings_of
 from warpmag.usd.values import Finding, attribute_findings, declaration_findings, finding_of, quiet
 
 
 @dataclass
 class StageContents:
-    """Contents of a stage and errors in it; paths are in the order of the stage.
+    """Contents of a stage and errors in it; paths are in the order of the stage."""
 
-    Attributes:
-        bodies: Rigid bodies, including kinematic ones.
-        kinematic: Kinematic bodies.
-        colliders: Colliders.
-        magnets: Magnets with valid attributes.
-        initial_moments: Authored moments [A·m²], world frame.
-        sources: Valid coils and field maps of each prim.
-        settings: Magnetic settings of the first physics scene.
-        motions: Keys of kinematic bodies, at time codes.
-        field_keys: Keys of the external field [A/m] at time codes, None where it is constant.
-        magnetization_keys: Keys of permanent magnets with variable magnetization [A/m].
-        findings: Errors and warnings.
-    """
-
-    bodies: list[str] = field(default_factory=list)
-    kinematic: list[str] = field(default_factory=list)
+    bodies: list[str] = field(default_factory=list)  # rigid bodies, including kinematic ones
+    kinematic: list[str] = field(default_factory=list)  # kinematic bodies
     colliders: list[str] = field(default_factory=list)
-    magnets: dict[str, Magnet] = field(default_factory=dict)
-    initial_moments: dict[str, tuple[float, float, float]] = field(default_factory=dict)
-    sources: dict[str, list[PlacedSource]] = field(default_factory=dict)
-    settings: MagneticSettings = field(default_factory=MagneticSettings)
-    motions: dict[str, Motion] = field(default_factory=dict)
-    field_keys: Keys | None = None
-    magnetization_keys: dict[str, Keys] = field(default_factory=dict)
-    findings: list[Finding] = field(default_factory=list)
+    magnets: dict[str, Magnet] = field(default_factory=dict)  # magnets with valid attributes
+    initial_moments: dict[str, tuple[float, float, float]] = field(default_factory=dict)  # authored [A·m²], world frame
+    sources: dict[str, list[PlacedSource]] = field(default_factory=dict)  # valid coils and field maps of each prim
+    settings: MagneticSettings = field(default_factory=MagneticSettings)  # of the first physics scene
+    motions: dict[str, Motion] = field(default_factory=dict)  # keys of kinematic bodies, at time codes
+    field_keys: Keys | None = None  # of the external field [A/m] at time codes, None where it is constant
+    magnetization_keys: dict[str, Keys] = field(default_factory=dict)  # of magnets with variable magnetization [A/m]
+    findings: list[Finding] = field(default_factory=list)  # errors and warnings
 
 
 def read_magnets(stage: Usd.Stage) -> StageMagnets:

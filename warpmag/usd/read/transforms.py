@@ -11,6 +11,8 @@ from warpmag.usd.values import LARGEST_COORDINATE, Finding, finding_of, instance
 
 _RESET = "!resetXformStack!"
 _INVERSE = "!invert!"
+SCALE_TOLERANCE = 1e-5
+"""Relative tolerance for equal scales and right angles of axes: poses are often in single precision."""
 
 
 def is_animated(prim: Usd.Prim) -> bool:
@@ -43,6 +45,23 @@ def rotation_of(matrix) -> np.ndarray:
     return np.array([*rotation.GetImaginary(), rotation.GetReal()])
 
 
+def rigid_fault(world: np.ndarray, *, may_mirror: bool = False) -> tuple[str, str]:
+    """Return the reason why a rigid body cannot have a world transform, and a comment on it; empty where it can."""
+    matrix, farthest = world[:3, :3], np.abs(world).max()
+    if not farthest <= LARGEST_COORDINATE:
+        return f"reaches {farthest:g}, beyond {LARGEST_COORDINATE:g}", ""
+    if np.linalg.norm(matrix, axis=1).min() < 1.0 / LARGEST_COORDINATE:
+        return f"has a scale of less than {1.0 / LARGEST_COORDINATE:g}", ""
+    gram = matrix @ matrix.T  # rotation and scale leave the axes at right angles
+    if np.abs(gram - np.diag(np.diag(gram))).max() > SCALE_TOLERANCE * np.trace(gram) / 3.0:
+        return "is sheared", ", which Newton imports wrongly"
+    if np.abs(world[:, 3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
+        return "is a projection", ", which no rigid body has"
+    if np.linalg.det(matrix) < 0.0 and not may_mirror:
+        return "is mirrored", ", which Newton imports wrongly: mirror the mesh instead"
+    return "", ""
+
+
 class TransformCheck:
     """Checks transforms of bodies and colliders; reports an error in composition once, at the prim that causes it."""
 
@@ -56,24 +75,12 @@ class TransformCheck:
         yield from self._lineage_findings(prim)
         if not self.is_sound(prim):
             return
-        path = str(prim.GetPath())
-        world = np.array(self._cache.GetLocalToWorldTransform(prim))
-        if not np.abs(world).max() <= LARGEST_COORDINATE:
-            yield Finding(path, f"transform reaches {np.abs(world).max():g}, beyond {LARGEST_COORDINATE:g}")
-            return
-        matrix = world[:3, :3]
-        gram = matrix @ matrix.T
-        # Rotation and scale leave the axes at right angles. Poses are often single precision: 1e-5.
-        size = np.trace(gram) / 3.0
-        if np.linalg.norm(matrix, axis=1).min() < 1.0 / LARGEST_COORDINATE:
-            yield Finding(path, f"transform has a scale of less than {1.0 / LARGEST_COORDINATE:g}")
-        elif np.abs(gram - np.diag(np.diag(gram))).max() > 1e-5 * size:
-            yield Finding(path, "transform is sheared, which Newton imports wrongly")
-        elif np.abs(world[:, 3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
-            yield Finding(path, "transform is a projection, which no rigid body has")
-        elif is_body(prim) and np.linalg.det(matrix) < 0.0:
-            yield Finding(path, "transform is mirrored, which Newton imports wrongly: mirror the mesh instead")
-        elif prim.IsA(UsdGeom.Sphere) and np.abs(np.diag(gram) - size).max() > 1e-5 * size:
+        path, world = str(prim.GetPath()), np.array(self._cache.GetLocalToWorldTransform(prim))
+        fault, comment = rigid_fault(world, may_mirror=not is_body(prim))
+        squares = (world[:3, :3] ** 2).sum(axis=1)
+        if fault:
+            yield Finding(path, f"transform {fault}{comment}")
+        elif prim.IsA(UsdGeom.Sphere) and np.abs(squares - squares.mean()).max() > SCALE_TOLERANCE * squares.mean():
             yield Finding(path, "a sphere with non-uniform scale would be imported as a ball: make it a mesh")
 
     def is_sound(self, prim: Usd.Prim) -> bool:

@@ -80,15 +80,10 @@ _VECTORS = (Gf.Vec2f, Gf.Vec2d, Gf.Vec3f, Gf.Vec3d)
 
 @dataclass(frozen=True)
 class Units:
-    """Units of a stage.
+    """Units of a stage."""
 
-    Attributes:
-        meters: Unit of length [m].
-        kilograms: Unit of mass [kg].
-    """
-
-    meters: float
-    kilograms: float
+    meters: float  # unit of length [m]
+    kilograms: float  # unit of mass [kg]
 
     @property
     def are_si(self) -> bool:
@@ -115,9 +110,6 @@ def convert_units(stage: Usd.Stage) -> None:
     """Convert a stage to SI units, in a layer of its session. Stages with SI units or invalid units stay unchanged.
 
     Instances become editable, as each needs its own converted values.
-
-    Raises:
-        InputError: An attribute cannot be converted.
     """
     units = units_of(stage)
     if units.are_si or not units.are_sound:

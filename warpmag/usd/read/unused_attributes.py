@@ -39,10 +39,7 @@ def stray_findings(prim: Usd.Prim) -> Iterator[Finding]:
 def kind_findings(prim: Usd.Prim, magnet: Magnet, *, keyed: bool) -> Iterator[Finding]:
     """Yield warnings about a permanent magnet without magnetization, and about values without effect on its kind.
 
-    Args:
-        prim: The prim.
-        magnet: The magnet of the prim.
-        keyed: Whether keys change the magnetization.
+    ``keyed`` is True where keys change the magnetization.
     """
     path = str(prim.GetPath())
     if magnet.kind == "permanent" and not (keyed or any(magnet.magnetization)):

@@ -50,17 +50,11 @@ INSTANCER = (
 
 @dataclass(frozen=True)
 class Column:
-    """One attribute of a frame.
-
-    Attributes:
-        kind: Its type.
-        paths: Paths of the prims that have it.
-        length: Elements of its array, None for an attribute that is no array.
-    """
+    """One attribute of a frame."""
 
     kind: _Kind
-    paths: Sequence[str]
-    length: int | None = None
+    paths: Sequence[str]  # of the prims that have the attribute
+    length: int | None = None  # number of elements of an array, None for an attribute that is no array
 
     @property
     def sizes(self) -> np.ndarray:

@@ -42,23 +42,14 @@ def reference(kind: int, payload: int, flags: int = 0) -> int:
 
 @dataclass(frozen=True)
 class LayerFile:
-    """An encoded layer.
+    """An encoded layer, with places in the file [bytes]."""
 
-    Attributes:
-        values: First part of the file; the place of the table of contents is not set yet.
-        structure: Last part of the file, valid directly behind ``values``.
-        contents: Place of the table of contents in ``structure`` [bytes].
-        heads: Place of the first head of time samples [bytes]; the heads are contiguous and still zero.
-        end_code: Place of ``endTimeCode`` [bytes].
-        types: References of each sampled attribute without the place of a value, shape [attributes].
-    """
-
-    values: bytes
-    structure: bytes
-    contents: int
-    heads: int
-    end_code: int
-    types: np.ndarray
+    values: bytes  # first part of the file; the place of the table of contents is not set yet
+    structure: bytes  # last part of the file, valid directly behind ``values``
+    contents: int  # place of the table of contents in ``structure``
+    heads: int  # place of the first head of time samples; the heads are contiguous and still zero
+    end_code: int  # place of ``endTimeCode``
+    types: np.ndarray  # references of each sampled attribute without the place of a value, shape [attributes]
 
 
 class OverLayer:
@@ -69,11 +60,7 @@ class OverLayer:
     """
 
     def __init__(self, sizes: np.ndarray):
-        """Create an empty layer.
-
-        Args:
-            sizes: Size of a value of each sampled attribute [bytes], shape [attributes].
-        """
+        """Create an empty layer; ``sizes`` are those of a value of each sampled attribute [bytes]."""
         self._sizes = sizes
         self._types, self._type_fields = list[int](), list[int]()
         self._tokens, self._strings = {";-)": 0}, dict[int, int]()  # properties are negative tokens, so none may be 0
@@ -175,9 +162,8 @@ class OverLayer:
     def _dictionary(self, value: dict[str, str | dict]) -> int:
         data = struct.pack("<Q", len(value))
         for key, item in value.items():
-            inner = (
-                self._dictionary(item) if isinstance(item, dict) else reference(STRING, self._string(item), _INLINED)
-            )
+            text = isinstance(item, str)
+            inner = reference(STRING, self._string(item), _INLINED) if text else self._dictionary(item)
             data += struct.pack("<IqQ", self._string(key), 8, inner)  # the reference follows 8 bytes behind this offset
         return reference(DICTIONARY, self._place(data))
 

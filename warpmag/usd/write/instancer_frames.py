@@ -13,11 +13,7 @@ _BLOCK = 8192
 
 
 class InstancerFrames:
-    """Converts bodies of one instancer into its arrays.
-
-    Attributes:
-        columns: The attributes of a frame.
-    """
+    """Converts bodies of one instancer into its arrays, the ``columns`` of a frame."""
 
     def __init__(self, instancer: BallInstancer):
         """Read the spheres of an instancer."""
@@ -32,15 +28,7 @@ class InstancerFrames:
     def values(
         self, body_q: np.ndarray, body_qd: np.ndarray, moments: np.ndarray, last_rotations: np.ndarray | None
     ) -> list[np.ndarray]:
-        """Return the values of :attr:`columns` in one frame, one row each.
-
-        Args:
-            body_q: Position [m] and quaternion (x, y, z, w) of each ball in the world, shape [n, 7].
-            body_qd: Linear [m/s] and angular velocity [rad/s], shape [n, 6].
-            moments: Moments [A·m²], world frame, shape [n, 3].
-            last_rotations: Orientations of the previous frame, None in the first. Each quaternion gets the sign closer
-                to the previous frame, so that interpolation takes the short way.
-        """
+        """Return the values of ``columns`` in one frame, see :meth:`Placements.place`; moments [A·m²], shape [n, 3]."""
         values = {name: np.empty((self._count, width), np.float32) for name, width in INSTANCE_ARRAYS.items()}
         values[MOMENTS_PRIMVAR] = moments
         box = np.array([[np.inf] * 3, [-np.inf] * 3])

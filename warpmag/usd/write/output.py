@@ -34,39 +34,25 @@ _UNLOCKABLE = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP)
 
 
 class Output:
-    """The files of a run.
-
-    Attributes:
-        root: The short root layer.
-        cache: The layer with the motion.
-        instances: The layer with the prims of instances.
-        checkpoint: The file of :meth:`save_checkpoint`.
-    """
+    """The files of a run."""
 
     def __init__(self, path: str | os.PathLike, scene: set[Path], *, copy_scene: bool = False):
         """Check that the files can be written; nothing is written yet.
 
-        Args:
-            path: File of the root layer.
-            scene: Resolved paths of the scene's files, which must not be overwritten.
-            copy_scene: Whether the scene will be copied.
-
-        Raises:
-            InputError: A file cannot be written.
+        ``path`` is the file of the root layer, ``scene`` the resolved paths of the scene's files, which must not be
+        overwritten.
         """
         self.root = usable_path(path)
         if self.root.suffix not in _SUFFIXES:
             raise InputError(f"{self.root}: the output must end in {', '.join(_SUFFIXES)}")
-        self.cache = self.beside(".cache.usdc")
-        self.instances = self.beside(".instances.usdc")
+        self.cache = self.beside(".cache.usdc")  # the layer with the motion
+        self.instances = self.beside(".instances.usdc")  # the layer with the prims of instances
         self.checkpoint = self.beside(".resume.npz")
         self._lock = -1
         self._folder: Path | None = None
+        copies = [self.beside(f".scene{end}") for end in _SCENES] if copy_scene else []
         with self.errors(self.root):
-            self._check(
-                scene,
-                [self.root, self.cache, self.instances] + copy_scene * [self.beside(f".scene{end}") for end in _SCENES],
-            )
+            self._check(scene, [self.root, self.cache, self.instances, *copies])
 
     def beside(self, ending: str) -> Path:
         """Return the file of the same stem with another ending."""
@@ -102,11 +88,7 @@ class Output:
     # ---------------------------------------------------------------------------------------------------------------
 
     def lock(self) -> None:
-        """Lock the files for this run until :meth:`close`. A lock ends with its process.
-
-        Raises:
-            InputError: Another run has locked them.
-        """
+        """Lock the files for this run until :meth:`close`, or the end of the process."""
         if self._lock >= 0:
             return
         path = self.root.with_name(f".{self.root.stem}.lock")
@@ -171,11 +153,7 @@ class Output:
         self.place(self.checkpoint)
 
     def load_checkpoint(self) -> tuple[dict[str, str], dict[str, np.ndarray]] | None:
-        """Return the identity of the run and the arrays of its checkpoint, None where there is none.
-
-        Raises:
-            InputError: The checkpoint cannot be read, or another version of warpmag wrote it.
-        """
+        """Return the identity of the run and the arrays of its checkpoint, None where there is none."""
         try:
             with open(self.checkpoint, "rb") as file, np.load(file, allow_pickle=False) as saved:
                 arrays = dict(saved)

@@ -7,24 +7,18 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from warpmag.declarations.rotations import conjugate, dot, multiply, rotate
+from warpmag.usd.read.prims import lineage
 from warpmag.usd.read.transforms import is_animated, rigid_part, rotation_of
 
 
 @dataclass(frozen=True)
 class Placed:
-    """Attributes of the prims of bodies, one row each.
+    """Attributes of the prims of bodies, one row each."""
 
-    Attributes:
-        positions: Translations in the parent frames [units of the stage], float64, shape [n, 3].
-        rotations: Orientations in the parent frames, quaternions (x, y, z, w), float32, shape [n, 4].
-        linear: Velocities in the body frames [units of the stage/s], float32, shape [n, 3].
-        angular: Angular velocities in the body frames [degrees/s], float32, shape [n, 3].
-    """
-
-    positions: np.ndarray
-    rotations: np.ndarray
-    linear: np.ndarray
-    angular: np.ndarray
+    positions: np.ndarray  # translations in the parent frames [units of the stage], float64, shape [n, 3]
+    rotations: np.ndarray  # orientations in the parent frames, quaternions (x, y, z, w), float32, shape [n, 4]
+    linear: np.ndarray  # velocities in the body frames [units of the stage/s], float32, shape [n, 3]
+    angular: np.ndarray  # angular velocities in the body frames [degrees/s], float32, shape [n, 3]
 
 
 class Placements:
@@ -41,9 +35,8 @@ class Placements:
         self.paths, self._unit = list(paths), unit
         self._transforms = UsdGeom.XformCache(Usd.TimeCode.Default())
         prims, moving = [stage.GetPrimAtPath(path) for path in self.paths], set(self.paths)
-        self.scales = _scales(
-            np.reshape([self._transforms.GetLocalToWorldTransform(prim) for prim in prims], (-1, 4, 4))
-        )
+        frames = np.reshape([self._transforms.GetLocalToWorldTransform(prim) for prim in prims], (-1, 4, 4))
+        self.scales = _scales(frames)
         self.resets = np.zeros(len(prims), dtype=bool)
         transformed: dict[int, np.ndarray] = {}
         known: dict[str, tuple[np.ndarray | None, float, bool]] = {}  # thousands of bodies may share a parent
@@ -51,11 +44,9 @@ class Placements:
             parent_path = path.rpartition("/")[0]
             if parent_path not in known:
                 parent = self._parent(prim, moving)
-                known[parent_path] = (
-                    (parent, 1.0, True)
-                    if parent is None
-                    else (parent, _scale(parent), np.array_equal(parent, np.eye(4)))
-                )
+                known[parent_path] = (None, 1.0, True)
+                if parent is not None:
+                    known[parent_path] = (parent, _scale(parent), np.array_equal(parent, np.eye(4)))
             parent, scale, is_identity = known[parent_path]
             self.resets[index] = parent is None
             self.scales[index] /= scale
@@ -67,16 +58,10 @@ class Placements:
         self._rotation_to_parent = np.reshape([conjugate(rotation_of(parent)) for parent in parents], (-1, 4))
 
     def _parent(self, prim, moving) -> np.ndarray | None:
-        """Return the parent's world transform; None where the prim must ignore it.
-
-        That is the case where the parent moves, or would shear a rotating body.
-        """
+        """Return the parent's world transform; None where the parent moves, or would shear a rotating body."""
         parent = prim.GetParent()
-        ancestor = parent
-        while ancestor and not ancestor.IsPseudoRoot():
-            if str(ancestor.GetPath()) in moving or is_animated(ancestor):
-                return None
-            ancestor = ancestor.GetParent()
+        if any(str(ancestor.GetPath()) in moving or is_animated(ancestor) for ancestor in lineage(parent)):
+            return None
         matrix = np.array(self._transforms.GetLocalToWorldTransform(parent))
         scale = _scale(matrix)
         # scales are often authored in single precision
@@ -84,13 +69,10 @@ class Placements:
         return matrix if similar else None
 
     def place(self, body_q: np.ndarray, body_qd: np.ndarray, last_rotations: np.ndarray | None) -> Placed:
-        """Return the attributes of the bodies in one frame.
+        """Return the attributes of the bodies in one frame, see :meth:`CacheWriter.add_frame`.
 
-        Args:
-            body_q: Body frames in the world (position [m], quaternion x y z w), shape [n, 7].
-            body_qd: Linear velocity of the center of mass [m/s] and angular velocity [rad/s], world, shape [n, 6].
-            last_rotations: Orientations of the previous frame, None in the first. Each quaternion gets the sign closer
-                to the previous frame, so that interpolation takes the short way.
+        Each quaternion gets the sign closer to that of the previous frame, ``last_rotations``, so that interpolation
+        takes the short way.
         """
         # column-major arrays halve the time
         positions, rotations = (values.astype(np.float64, order="F") for values in (body_q[:, :3], body_q[:, 3:]))
@@ -107,8 +89,7 @@ class Placements:
         if last_rotations is not None:
             rotations *= np.where(dot(rotations, last_rotations) < 0.0, -1.0, 1.0)
         return Placed(
-            positions / self._unit,
-            *(values.astype(np.float32) for values in (rotations, linear / self._unit, angular)),
+            positions / self._unit, *(values.astype(np.float32) for values in (rotations, linear / self._unit, angular))
         )
 
 

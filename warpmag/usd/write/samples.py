@@ -27,16 +27,7 @@ from typing import BinaryIO
 import numpy as np
 
 from warpmag.errors import InputError
-from warpmag.usd.write.crate import (
-    CONTENTS,
-    DOUBLE_VECTOR,
-    HEAD,
-    MAGIC,
-    SECTION,
-    SECTION_NAME,
-    LayerFile,
-    reference,
-)
+from warpmag.usd.write.crate import CONTENTS, DOUBLE_VECTOR, HEAD, MAGIC, SECTION, SECTION_NAME, LayerFile, reference
 
 _AHEAD = 512
 """References written to a row in advance: one page of the file. Each frame writes those of some rows."""
@@ -49,50 +40,26 @@ _FIRST_CAPACITY = 64
 
 @dataclass
 class _Places:
-    """Places in the file [bytes]: the state from which a file can be continued.
+    """Places in the file [bytes]: the state from which a file can be continued."""
 
-    Attributes:
-        heads: Place of the heads.
-        end_code: Place of the layer's ``endTimeCode``.
-        types: References of each attribute without the place of a value, shape [attributes].
-        first_frames: First frame of each contiguous block of frames.
-        stretches: Place of each block.
-        capacity: Frames that fit in all blocks.
-        times: Place of the number of frames, followed by their time codes; an empty list precedes, the rows follow.
-        size: Least size of the file, up to the end of the structure.
-        filled: Number of frames whose references are written.
-        count: Number of frames.
-        sampled: Whether an attribute has samples, shape [attributes].
-    """
-
-    heads: int
-    end_code: int
-    types: np.ndarray
-    first_frames: np.ndarray
-    stretches: np.ndarray
-    sampled: np.ndarray
-    capacity: int = 0
-    times: int = 0
-    size: int = 0
-    filled: int = 0
-    count: int = 0
+    heads: int  # place of the heads
+    end_code: int  # place of the layer's ``endTimeCode``
+    types: np.ndarray  # references of each attribute without the place of a value, shape [attributes]
+    first_frames: np.ndarray  # first frame of each contiguous block of frames
+    stretches: np.ndarray  # place of each block
+    sampled: np.ndarray  # True for each attribute with samples, shape [attributes]
+    capacity: int = 0  # frames that fit in all blocks
+    times: int = 0  # place of the number of frames, followed by their time codes; an empty list precedes, rows follow
+    size: int = 0  # least size of the file, up to the end of the structure
+    filled: int = 0  # number of frames whose references are written
+    count: int = 0  # number of frames
 
 
 class SampleFile:
-    """A crate file to which frames are appended.
-
-    Attributes:
-        count: Number of frames.
-    """
+    """A crate file to which frames are appended."""
 
     def __init__(self, file: BinaryIO, sizes: np.ndarray, places: _Places):
-        """Wrap an open file; use :meth:`begin` or :meth:`resume`.
-
-        Args:
-            file: The file, open for reading and writing, unbuffered.
-            sizes: Size of a value of each attribute [bytes], in the order of a frame, shape [attributes].
-            places: Places in the file.
-        """
+        """Wrap an unbuffered file, open for reading and writing; use :meth:`begin` or :meth:`resume`."""
         self._file, self._places = file, places
         self._offsets = (np.cumsum(sizes) - sizes).astype(np.uint64)
         self._frame_size = int(np.sum(sizes))
@@ -101,12 +68,12 @@ class SampleFile:
 
     @classmethod
     def begin(cls, path: str | os.PathLike, layer: LayerFile, sizes: np.ndarray, frames: int | None) -> "SampleFile":
-        """Create a file with a layer and space for samples.
+        """Create a file, which must not exist, with a layer and space for samples.
 
         Args:
-            path: The file, which must not exist.
+            path: The file.
             layer: The layer.
-            sizes: Size of a value of each attribute [bytes], shape [attributes].
+            sizes: Size of a value of each attribute [bytes], in the order of a frame, shape [attributes].
             frames: Expected number of frames; there may be more.
         """
         with contextlib.ExitStack() as stack:
@@ -123,12 +90,7 @@ class SampleFile:
 
     @classmethod
     def resume(cls, path: str | os.PathLike, sizes: np.ndarray, places: dict[str, np.ndarray]) -> "SampleFile":
-        """Continue a file from an earlier :meth:`places`; later frames are dropped.
-
-        Raises:
-            InputError: The file is a different one, or incomplete.
-            OSError: It cannot be opened or written.
-        """
+        """Continue a file from an earlier :meth:`places`; later frames are dropped."""
         with contextlib.ExitStack() as stack:
             file = stack.enter_context(open(path, "r+b", buffering=0))
             fields = {name: value if value.ndim else int(value) for name, value in places.items()}
@@ -155,15 +117,12 @@ class SampleFile:
         return {name: np.asarray(value) for name, value in asdict(self._places).items()}
 
     def append(self, code: float, values: bytes, changed: np.ndarray) -> None:
-        """Append a frame.
+        """Append a frame with a time code greater than the last one; after an error the frame is not in the file.
 
         Args:
-            code: Its time code, greater than the last one.
+            code: The time code.
             values: Values of all attributes, contiguous.
             changed: Attributes without samples whose value now differs from the first frame, shape [n].
-
-        Raises:
-            OSError: The file cannot be written; the frame is not in it.
         """
         if self.count == self._places.capacity:
             self._extend(os.fstat(self._file.fileno()).st_size, 2 * self.count, _Structure.read(self._file))
@@ -264,11 +223,7 @@ class SampleFile:
     def _fill_rows(self, first: int, last: int, begin: int, end: int) -> None:
         """Write references of frames, which may not exist yet, to rows; in front of frame 0 the number of samples.
 
-        Args:
-            first: First frame.
-            last: One past the last frame.
-            begin: First row.
-            end: One past the last row.
+        The frames are from ``first`` to ``last - 1``, the rows from ``begin`` to ``end - 1``.
         """
         frames = self._frame_places(first, last)
         block = max(1, _BLOCK // max(1, last - first))
@@ -307,12 +262,7 @@ class SampleFile:
 
 
 class _Structure:
-    """The structure of a layer: sections, and the table of contents with their places.
-
-    Attributes:
-        start: Place of the structure.
-        contents: Place of the table of contents.
-    """
+    """The structure of a layer: sections, and the table of ``contents`` with their places."""
 
     def __init__(self, data: bytes, start: int, contents: int):
         """Wrap the bytes of the structure, which begin at ``start``."""

@@ -12,17 +12,11 @@ from warpmag.usd.write.output import Output
 
 
 def copy_scene(stage: Usd.Stage, output: Output) -> tuple[Path, Path]:
-    """Write a temporary copy of a stage's scene, to be moved beside the run's output.
+    """Write a temporary copy of a stage's scene; return the file or folder, and the root layer of the scene in it.
 
     A scene of one layer becomes ``out.scene.usdc``, a package ``out.scene.usdz``. A scene with sublayers, references,
     payloads or assets such as textures becomes a folder ``out.scene`` with all files in their relative places. The copy
     includes unsaved edits.
-
-    Returns:
-        The file or folder, and the root layer of the scene in it.
-
-    Raises:
-        InputError: A package has unsaved edits.
     """
     scene, edited = stage.GetRootLayer(), unsaved_layers(stage)
     for layer in edited:

@@ -43,24 +43,16 @@ _CHECKPOINT_SHARE = 0.01
 
 @dataclass(frozen=True)
 class PreviousRun:
-    """An earlier run whose output is being continued.
+    """An earlier run whose output is being continued."""
 
-    Attributes:
-        time: Time of its last frame since the start of the stage [s].
-        state: The saved state of the run; None if it was complete.
-    """
-
-    time: float
-    state: dict[str, np.ndarray] | None
+    time: float  # time of its last frame since the start of the stage [s]
+    state: dict[str, np.ndarray] | None  # the saved state of the run; None if it was complete
 
 
 class _Rows:
-    """Assignment of a run's rows to prims and instancers.
+    """Rows of a run's ``bodies`` and ``magnets`` that have prims.
 
-    Attributes:
-        bodies: Rows of the bodies that have prims.
-        magnets: Rows of the magnets that have prims.
-        of_instancers: For each instancer the rows of its balls and of their magnets, -1 for balls without.
+    ``of_instancers`` are the rows of each instancer's balls and of their magnets, -1 for balls without a magnet.
     """
 
     def __init__(self, body_paths: Sequence[str], magnet_paths: Sequence[str], instancers: Sequence[BallInstancer]):
@@ -144,13 +136,9 @@ class CacheWriter:
         self.close(complete=kind is None)
 
     def resume(self) -> PreviousRun | None:
-        """Continue the run at the output; call it before the first frame.
+        """Continue the run at the output, before the first frame; return it, None if there is none.
 
-        Returns:
-            The previous run, None if there is none. A complete run stays unchanged.
-
-        Raises:
-            InputError: Another process is writing there, or the output belongs to another run or to no run.
+        A complete run stays unchanged. An output of another run, or of a running process, raises :class:`InputError`.
         """
         if not (self._output.root.exists() or self._output.checkpoint.exists()):
             return None
@@ -201,23 +189,14 @@ class CacheWriter:
         """Digest of the scene and the options: equal for runs that may continue each other."""
         return {"scene": _digest(self._stage), **self._options}
 
-    def add_frame(
-        self,
-        time: float,
-        body_q: np.ndarray,
-        body_qd: np.ndarray,
-        moments: np.ndarray,
-    ) -> None:
-        """Write one frame.
+    def add_frame(self, time: float, body_q: np.ndarray, body_qd: np.ndarray, moments: np.ndarray) -> None:
+        """Write one frame; if that fails, the stage keeps the earlier frames.
 
         Args:
             time: Time since the start of the stage [s]; must increase from frame to frame.
             body_q: Body frames in the world (position [m], quaternion x y z w), shape [n, 7].
             body_qd: Linear velocity of the center of mass [m/s] and angular velocity [rad/s], world, shape [n, 6].
             moments: Moments of the magnets [A·m²], world frame, shape [m, 3].
-
-        Raises:
-            InputError: It cannot be written; the stage keeps the earlier frames.
         """
         if not time > self._last_time:
             raise ValueError(f"time must increase from frame to frame: {time} after {self._last_time}")
@@ -228,9 +207,8 @@ class CacheWriter:
         placed = self._bodies.place(body_q[rows.bodies], body_qd[rows.bodies], last and last[1])
         values = [placed.positions, placed.rotations, placed.linear, placed.angular, moments[rows.magnets]]
         for instancer, (balls, magnets) in zip(self._instancers, rows.of_instancers, strict=True):
-            ball_moments = np.where(
-                magnets[:, None] < 0, np.float32(0.0), moments[magnets] if len(moments) else np.float32(0.0)
-            )
+            ball_moments = moments[magnets] if len(moments) else np.zeros((len(magnets), 3), np.float32)
+            ball_moments[magnets < 0] = 0.0
             last_rotations = last and last[len(values) + 1]
             values += instancer.values(body_q[balls], body_qd[balls], ball_moments, last_rotations)
         if self._samples is None:
@@ -244,14 +222,7 @@ class CacheWriter:
         return clock_time.monotonic() >= self._save_time
 
     def save(self, state: dict[str, np.ndarray] | None) -> None:
-        """Write the root layer and a checkpoint, after at least one frame.
-
-        Args:
-            state: State from which the run can continue after the last frame; None if it cannot be resumed.
-
-        Raises:
-            InputError: It cannot be written.
-        """
+        """Write the root layer, and a checkpoint with the ``state`` after the last frame unless it is None."""
         assert self._samples is not None
         began = clock_time.monotonic()
         self._place_root()
@@ -265,11 +236,7 @@ class CacheWriter:
         self._save_time = began + max(_CHECKPOINT_SECONDS, spent / _CHECKPOINT_SHARE)
 
     def close(self, complete: bool = True) -> None:
-        """Close the files; a second call does nothing.
-
-        Args:
-            complete: Whether all frames are written, so that the checkpoint can be removed.
-        """
+        """Close the files, and remove the checkpoint of a complete run; a second call does nothing."""
         samples, self._samples = self._samples, None
         output = self._output
         try:
