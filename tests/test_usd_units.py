@@ -12,7 +12,7 @@ from warpmag.engine.stepping.scene import import_scene
 from warpmag.engine.stepping.simulation import Simulation
 from warpmag.errors import InputError
 from warpmag.usd import check, open_stage, survey
-from warpmag.usd.read.units import _powers
+from warpmag.usd.read.units import _exponents
 
 SI, ARTIST = (1.0, 1.0, "Z"), (0.01, 1.0, "Y")
 GRAMS = (0.01, 0.001, "Z")
@@ -368,5 +368,5 @@ def test_each_attribute_of_newton_with_a_unit_is_converted_or_refused():
                 continue
             found += 1
             with contextlib.suppress(InputError):
-                kept += [name] if _powers(prim, name) == (0, 0) else []
+                kept += [name] if _exponents(prim, name) == (0, 0) else []
     assert kept == [] and found > 50

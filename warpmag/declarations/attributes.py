@@ -31,8 +31,8 @@ class Attribute:
     uniform: bool = False  # True if USD allows no time samples
     kind: str = ""  # kind of magnets that the attribute describes, empty for all
     optional: bool = False  # True if warpmag omits the default from the stages that it writes
-    # effect of a change of a Newton model's array: from the next substep on; after ``Magnetics.notify_model_changed``;
-    # an error
+    # A change of a Newton model's array takes effect from the next substep on, or after
+    # ``Magnetics.notify_model_changed``, or raises an error.
     model_change: Literal["substep", "notified", "never"] = "never"
     field: str = ""  # field of the record; attributes of USD alone have a name in the same style
     default: Any = None  # None where the attribute has no default

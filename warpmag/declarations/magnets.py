@@ -40,7 +40,7 @@ SATURATION_OF_IRON = 1.7e6
 
 
 def check_curve(name: str, value: Any, others: tuple[str, ...] = ()) -> None:
-    """Raise :class:`InputError` unless ``value`` is measured or in :data:`CURVES`; the message adds ``others``."""
+    """Raise :class:`InputError` unless ``value`` is a measured curve or in :data:`CURVES`, listed with ``others``."""
     if not isinstance(value, MagnetizationCurve) and not (isinstance(value, str) and value in CURVES):
         check_token(name, value, (*CURVES, *others))
 

@@ -96,7 +96,7 @@ def author(prim: Usd.Prim, attribute: Attribute, value: Any) -> None:
 
 
 def read_fields(prim: Usd.Prim, attributes: Iterable[Attribute]) -> dict[str, Any]:
-    """Return the values of attributes of ``prim`` by field, without those without value; check only their types."""
+    """Return the values of attributes of ``prim`` by field, as far as they have one; check only their types."""
     values = {}
     for row in attributes:
         attribute = prim.GetAttribute(row.usd_name)
@@ -135,7 +135,7 @@ class ColliderMagnet:
     """The magnet of one collider, for the shape that Newton makes of the collider."""
 
     magnet: Magnet  # magnetization in the frame of the prim that declares it
-    frames: tuple[np.ndarray, ...]  # world matrices of that prim and of the collider, for row vectors; or none if equal
+    frames: tuple[np.ndarray, ...]  # world matrices of that prim and the collider, for row vectors; empty for one prim
     axis: str | None  # token of the axis of a capsule, cylinder or cone, None for other shapes
 
 

@@ -45,7 +45,7 @@ _TOKENS = {**dict.fromkeys(("axis", "physics:axis"), ("X", "Y", "Z")), "orientat
 _QUATERNIONS = ("physics:principalAxes", "physics:localRot0", "physics:localRot1")
 _INERTIA_TOLERANCE = 1e-2
 """Largest excess of an often rounded moment of inertia over the other two, as a fraction of the sum of all three."""
-_READ = ("physics:", "newton:", "mjc:", "drive:", "limit:")
+_READ_NAMESPACES = ("physics:", "newton:", "mjc:", "drive:", "limit:")
 _SHAPES = {
     "Sphere": ("radius",),
     "Cube": ("size",),
@@ -76,7 +76,7 @@ _DECLARED = {
     ),
 }
 """Keys and values of the customData by which an attribute of a scene is declared to Newton."""
-_OPTIONS = ("newton:joint_drive_gains_scaling", "newton:collapse_fixed_joints")
+_SCENE_OPTIONS = ("newton:joint_drive_gains_scaling", "newton:collapse_fixed_joints")
 """Other attributes of a scene that Newton reads, though no schema has them."""
 
 
@@ -140,7 +140,7 @@ def attribute_findings(prim: Usd.Prim, *, shape: bool) -> Iterator[Finding]:
 
     ``shape`` adds the attributes of the prim's shape.
     """
-    names = [name for name in prim.GetAuthoredPropertyNames() if name.startswith(_READ)]
+    names = [name for name in prim.GetAuthoredPropertyNames() if name.startswith(_READ_NAMESPACES)]
     for name in (*names, *(_SHAPES.get(prim.GetTypeName(), ()) if shape else ())):
         attribute = prim.GetAttribute(name)
         if not attribute:
@@ -159,7 +159,7 @@ def attribute_findings(prim: Usd.Prim, *, shape: bool) -> Iterator[Finding]:
 def declaration_findings(scene: Usd.Prim) -> Iterator[Finding]:
     """Yield findings about ``newton`` properties of a scene in no schema: Newton reads them as declarations."""
     path = str(scene.GetPath())
-    known = {*scene.GetPrimDefinition().GetPropertyNames(), *_newton_attributes(), *_OPTIONS}
+    known = {*scene.GetPrimDefinition().GetPropertyNames(), *_newton_attributes(), *_SCENE_OPTIONS}
     for attribute in scene.GetAuthoredPropertiesInNamespace("newton"):
         name = attribute.GetName()
         if name in known:
@@ -255,7 +255,7 @@ def declared(attribute: Usd.Attribute):
 
 
 @cache
-def _known() -> dict[str, object]:
+def _defaults_by_name() -> dict[str, object]:
     """Return the defaults of attributes that Newton reads by name, whether or not their schema is applied."""
     return {name: value for schema in _SCHEMAS for name, value in _defaults(schema).items()}
 
@@ -281,7 +281,7 @@ def _expected(prim, attribute):
     name = attribute.GetName()
     fallback = prim.GetPrimDefinition().GetAttributeFallbackValue(name)
     if fallback is None:
-        fallback = _known().get(name)
+        fallback = _defaults_by_name().get(name)
     return (declared(attribute) if fallback is None else fallback), fallback
 
 

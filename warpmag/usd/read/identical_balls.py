@@ -104,7 +104,7 @@ class BallFrames:
     def velocities(self, arrays: dict[str, np.ndarray], first: np.ndarray | None = None) -> np.ndarray:
         """Return linear [m/s] and angular velocities [rad/s] of the bodies in the world, shape [n, 6].
 
-        Where the arrays have none, all bodies have those of the ``first``, shape [6], in their own frames; else zero.
+        Where the arrays have none, each body has those of the ``first``, shape [6], by default zero, in its own frame.
         """
         linear, angular = arrays["velocities"], np.radians(arrays["angularVelocities"])
         rotations = self._rotations(arrays)

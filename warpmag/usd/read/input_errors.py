@@ -40,7 +40,7 @@ def newton_errors(stage_name: str, action: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:  # of any kind: no traceback of Newton or Warp is to reach the user
-        message = failure(error) if isinstance(error, Tf.ErrorException) else one_line_of(error)
+        message = first_line(error) if isinstance(error, Tf.ErrorException) else one_line_of(error)
         raise InputError(f"{stage_name}: Newton cannot {action} it ({message or type(error).__name__})") from None
     for message in (*(one_line_of(warning.message) for warning in caught), *logged):
         if _LOSSES.search(message) and not message.startswith(_REPORTED):
@@ -67,10 +67,10 @@ def _logged_warnings() -> Iterator[list[str]]:
 
 
 @contextlib.contextmanager
-def usd_errors(stage_name: str, otherwise: str = "USD cannot read it") -> Iterator[None]:
+def usd_errors(stage_name: str, message: str = "USD cannot read it") -> Iterator[None]:
     """Raise :class:`InputError` for exceptions of USD in the block, and keep USD's messages off stderr.
 
-    Its message is ``otherwise``, followed by USD's own in brackets.
+    USD's own message follows ``message`` in brackets.
     """
     try:
         with quiet():
@@ -78,10 +78,10 @@ def usd_errors(stage_name: str, otherwise: str = "USD cannot read it") -> Iterat
     except InputError:
         raise
     except USD_FAILURES as error:
-        raise InputError(f"{stage_name}: {otherwise} ({failure(error)})") from None
+        raise InputError(f"{stage_name}: {message} ({first_line(error)})") from None
 
 
-def failure(error: Exception) -> str:
+def first_line(error: Exception) -> str:
     """Return the first line of the message of an exception that USD raised."""
     if isinstance(error, UnicodeDecodeError):
         return _NOT_TEXT

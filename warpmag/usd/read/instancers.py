@@ -62,7 +62,6 @@ class _Prototype:
     """A prototype of instances."""
 
     path: Sdf.Path  # of its root
-    name: str  # of its root
     order: list[str] | None  # transform operations of its root without the reset of the stack, None if it has no reset
     bodies: tuple[tuple[Sdf.Path, Gf.Matrix4d], ...]  # path below the root, and transform relative to the root's parent
     magnets: tuple[Sdf.Path, ...]  # paths of the magnets in it, below the root
@@ -252,9 +251,9 @@ def _prototype(root: Usd.Prim) -> _Prototype:
         for prim in prims
         if is_body(prim)
     )
-    kept = [name for name in order if name != _RESET] if order and _RESET in order else None
+    order = [name for name in order if name != _RESET] if order and _RESET in order else None
     magnets = tuple(prim.GetPath().MakeRelativePath(root.GetPath()) for prim in prims if has_api(prim, MAGNET_API))
-    return _Prototype(root.GetPath(), root.GetName(), kept, bodies, magnets, len(prims))
+    return _Prototype(root.GetPath(), order, bodies, magnets, len(prims))
 
 
 def _write_instances(layer, path, prefix: str, instances: _Instances, prototypes, samples, rows: list[int]) -> None:
@@ -268,7 +267,7 @@ def _write_instances(layer, path, prefix: str, instances: _Instances, prototypes
             _write_prototype(prim, prototype)
             _write_velocities(prim, prototype, instances, row)
             if len(prototype.magnets) == 1 and (moment := instances.value(MOMENTS_PRIMVAR, row)) is not None:
-                magnet = prim.path.AppendChild(prototype.name).AppendPath(prototype.magnets[0])
+                magnet = prim.path.AppendChild(prototype.path.name).AppendPath(prototype.magnets[0])
                 Sdf.AttributeSpec(Sdf.CreatePrimInLayer(layer, magnet), MOMENT, _TYPES.Vector3f).default = moment
 
 
@@ -298,7 +297,7 @@ def _write_order(prim: Sdf.PrimSpec, order: list[str]) -> None:
 
 
 def _write_prototype(instance: Sdf.PrimSpec, prototype: _Prototype) -> None:
-    prim = Sdf.PrimSpec(instance, prototype.name, Sdf.SpecifierDef)
+    prim = Sdf.PrimSpec(instance, prototype.path.name, Sdf.SpecifierDef)
     prim.active, prim.instanceable = True, False
     prim.referenceList.Prepend(Sdf.Reference("", prototype.path))
     if prototype.order is not None:
@@ -318,7 +317,7 @@ def _write_velocities(prim: Sdf.PrimSpec, prototype: _Prototype, instances: _Ins
         placed = matrix * Gf.Matrix4d().SetScale(Gf.Vec3d(scale)) * rotation
         to_body = Gf.Transform(placed).GetRotation().GetInverse()
         tangential = Gf.Cross(angular, placed.ExtractTranslation()) * np.pi / 180.0
-        path = prim.path.AppendChild(prototype.name).AppendPath(below)
+        path = prim.path.AppendChild(prototype.path.name).AppendPath(below)
         body = Sdf.CreatePrimInLayer(prim.layer, path)
         for name, value, authored_value in (
             ("physics:velocity", to_body.TransformDir(linear + tangential), authored[0]),

@@ -31,7 +31,7 @@ class KeyReader:
         self._moving: dict[Sdf.Path, bool] = {}
 
     @cached_property
-    def plain(self) -> Usd.Stage:
+    def unfrozen(self) -> Usd.Stage:
         """The stage without frozen values."""
         return without_frozen(self._stage)
 
@@ -52,7 +52,7 @@ class KeyReader:
     def motion(self, prim: Usd.Prim) -> Motion:
         """Return the keyed transform operations of a prim and its parents, at time codes of the stage."""
         operations: list[Operation] = []
-        for parent in lineage(self.plain.GetPrimAtPath(prim.GetPath())):
+        for parent in lineage(self.unfrozen.GetPrimAtPath(prim.GetPath())):
             if parent.IsA(UsdGeom.Xformable):
                 xform = UsdGeom.Xformable(parent)
                 operations = [*_without_identities([_operation(op) for op in xform.GetOrderedXformOps()]), *operations]
@@ -65,7 +65,7 @@ class KeyReader:
 
         ``read`` is a function of the name in messages and a value. It checks the value and returns its numbers.
         """
-        attribute = self.plain.GetPrimAtPath(prim.GetPath()).GetAttribute(name)
+        attribute = self.unfrozen.GetPrimAtPath(prim.GetPath()).GetAttribute(name)
         times = attribute.GetTimeSamples() if attribute else ()
         where = f"{prim.GetPath()}: {name}"
         if len(times) < 2:
@@ -77,7 +77,7 @@ class KeyReader:
         path = str(prim.GetPath())
         times = np.unique(np.concatenate([op.keys.times for op in motion.operations if len(op.keys.times) > 1]))
         times = np.unique(np.concatenate([times, 0.5 * (times[1:] + times[:-1])]))
-        prim, transforms, scales = self.plain.GetPrimAtPath(prim.GetPath()), UsdGeom.XformCache(), None
+        prim, transforms, scales = self.unfrozen.GetPrimAtPath(prim.GetPath()), UsdGeom.XformCache(), None
         for time in times.tolist():
             transforms.SetTime(time)
             world = np.array(transforms.GetLocalToWorldTransform(prim))
@@ -92,7 +92,7 @@ class KeyReader:
 
     def _varies(self, path: Sdf.Path) -> bool:
         """Return whether the prim's own transform differs between its samples."""
-        for op in UsdGeom.Xformable(self.plain.GetPrimAtPath(path)).GetOrderedXformOps():
+        for op in UsdGeom.Xformable(self.unfrozen.GetPrimAtPath(path)).GetOrderedXformOps():
             if op.GetAttr().HasSpline():
                 return True
             values = [_sample(op.GetAttr(), time) for time in op.GetTimeSamples()]

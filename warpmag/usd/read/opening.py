@@ -8,7 +8,6 @@ unchanged.
 
 import os
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdGeom
@@ -56,7 +55,7 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
 
 def open_deferred(path: str | os.PathLike, time_code: float | None = None) -> tuple[Usd.Stage, list[IdenticalBalls]]:
     """Open a stage like :func:`open_stage`, but leave prims of identical balls to :func:`complete_instances`."""
-    file = _existing(path)
+    file = _readable(path)
     if reason := trial_read(full_path(file)):
         raise InputError(f"{path}: {reason}")
     stage = _open(file, path)
@@ -73,14 +72,14 @@ def open_animated(path: str | os.PathLike) -> tuple[Usd.Stage, list[BallInstance
 
     There is no trial read in a child process: for a long run it would take longer than the export.
     """
-    stage = _open(_existing(path), path)
+    stage = _open(_readable(path), path)
     with usd_errors(str(path)):
         deferred = expand_instancers(stage, start_of(stage), defer=True)
         complete_instances([balls for balls in deferred if not balls.stays_instancer])
         return stage, ball_instancers(stage, deferred)
 
 
-def _existing(path: str | os.PathLike) -> Path:
+def _readable(path: str | os.PathLike) -> Path:
     """Return a path that USD can name; raises :class:`InputError` unless it can be opened for reading."""
     file = usable_path(path)
     if not os.path.isfile(file):
@@ -96,19 +95,14 @@ def _open(file: Path, path: str | os.PathLike) -> Usd.Stage:
     """Open an existing file, with the name ``path`` in messages."""
     with usd_errors(str(path), NOT_USD):
         stage = Usd.Stage.Open(str(full_path(file)))
-        _reload(stage)
+        for layer in stage.GetUsedLayers():
+            if layer.realPath and not layer.dirty:  # its file may have changed since it was read
+                layer.Reload()
         broken = [str(error) for error in stage.GetCompositionErrors()]
     if broken:
         raise InputError(f"{path}: {one_line_of(broken[0])}")
     check_rates(stage)
     return stage
-
-
-def _reload(stage: Usd.Stage) -> None:
-    """Reload layers with files that have changed since they were read, except for layers with unsaved edits."""
-    for layer in stage.GetUsedLayers():
-        if layer.realPath and not layer.dirty:
-            layer.Reload()
 
 
 @quiet()
@@ -166,7 +160,13 @@ def _value_at(attribute, time_code):
 
 def _block_addresses(stage: Usd.Stage) -> None:
     """Block shader inputs with network addresses, from which Newton would fetch textures, in the session layer."""
-    addresses = list(_addresses(stage))
+    addresses = []
+    for prim in descendants(stage.GetPseudoRoot()):
+        for attribute in prim.GetAuthoredPropertiesInNamespace("inputs"):
+            value = attribute.Get() if isinstance(attribute, Usd.Attribute) else None
+            text = value.path if isinstance(value, Sdf.AssetPath) else value
+            if isinstance(text, str) and _ADDRESS.match(text):
+                addresses.append((attribute, text))
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         for attribute, address in addresses:
             prim = attribute.GetPrim()
@@ -176,16 +176,6 @@ def _block_addresses(stage: Usd.Stage) -> None:
                     "fetched from a network: name a file, or set instanceable = false"
                 )
             attribute.Block()
-
-
-def _addresses(stage: Usd.Stage) -> Iterator[tuple[Usd.Attribute, str]]:
-    """Yield shader inputs whose values are network addresses, and the addresses."""
-    for prim in descendants(stage.GetPseudoRoot()):
-        for attribute in prim.GetAuthoredPropertiesInNamespace("inputs"):
-            value = attribute.Get() if isinstance(attribute, Usd.Attribute) else None
-            text = value.path if isinstance(value, Sdf.AssetPath) else value
-            if isinstance(text, str) and _ADDRESS.match(text):
-                yield attribute, text
 
 
 def first_camera(stage: Usd.Stage) -> Usd.Prim | None:

@@ -51,7 +51,6 @@ def read_recording(stage: Usd.Stage, instancers: Sequence[BallInstancer] = ()) -
     fields = [prim.GetAttribute("warpmag:externalField") for prim in prims if has_api(prim, SCENE_API)]
     codes = _codes(stage, bodies, magnets, instancers)
     seconds = (codes - codes[0]) / stage.GetTimeCodesPerSecond()
-    positions, rotations, linear, angular = _motion(bodies, codes, seconds)
     moments = [_values(prim.GetAttribute(MOMENT), codes, Vt.Vec3fArray) for prim in magnets]
     moments = np.stack(moments, axis=1) if moments else np.zeros((len(codes), 0, 3), dtype=np.float32)
     recording = Recording(
@@ -59,10 +58,7 @@ def read_recording(stage: Usd.Stage, instancers: Sequence[BallInstancer] = ()) -
         seconds,
         UsdGeom.GetStageMetersPerUnit(stage),
         [str(prim.GetPath()) for prim in bodies],
-        positions,
-        rotations,
-        linear,
-        angular,
+        *_motion(bodies, codes, seconds),
         [str(prim.GetPath()) for prim in magnets],
         moments.astype(np.float32),
         np.array([prim.GetAttribute("warpmag:kind").Get() == "permanent" for prim in magnets], dtype=bool),
@@ -73,7 +69,7 @@ def read_recording(stage: Usd.Stage, instancers: Sequence[BallInstancer] = ()) -
     return recording
 
 
-def _motion(bodies: list[Usd.Prim], codes: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, ...]:
+def _motion(bodies: list[Usd.Prim], codes: np.ndarray, seconds: np.ndarray):
     """Return positions, rotations, linear and angular velocities of bodies, see :class:`Recording`."""
     poses = _Poses(codes)
     shape = len(codes), len(bodies)

@@ -91,16 +91,16 @@ def _ignored_override(prim: Usd.Prim) -> Sdf.PrimSpec | None:
             continue
         for layer in node.layerStack.layers:
             spec = layer.GetPrimAtPath(node.path) if layer not in added else None
-            override = next(filter(None, map(_opinion, spec.nameChildren)), None) if spec else None
+            override = next(filter(None, map(_first_opinion, spec.nameChildren)), None) if spec else None
             if override:
                 return override
     return None
 
 
-def _opinion(spec: Sdf.PrimSpec) -> Sdf.PrimSpec | None:
+def _first_opinion(spec: Sdf.PrimSpec) -> Sdf.PrimSpec | None:
     """Return the first prim of a tree with an opinion."""
     has_opinion = spec.specifier != Sdf.SpecifierOver or spec.properties or set(spec.ListInfoKeys()) > {"specifier"}
-    return spec if has_opinion else next(filter(None, map(_opinion, spec.nameChildren)), None)
+    return spec if has_opinion else next(filter(None, map(_first_opinion, spec.nameChildren)), None)
 
 
 def unsaved_layers(stage: Usd.Stage) -> list[Sdf.Layer]:
@@ -110,7 +110,7 @@ def unsaved_layers(stage: Usd.Stage) -> list[Sdf.Layer]:
 
 def without_frozen(stage: Usd.Stage) -> Usd.Stage:
     """Return the stage without frozen values, with its time samples."""
-    return _opened(stage, list(stage.GetSessionLayer().subLayerPaths))
+    return _reopened(stage, list(stage.GetSessionLayer().subLayerPaths))
 
 
 def as_written(stage: Usd.Stage) -> Usd.Stage:
@@ -119,7 +119,7 @@ def as_written(stage: Usd.Stage) -> Usd.Stage:
     added = [layer.identifier] if layer else []
     session = stage.GetSessionLayer()
     unchanged = list(session.subLayerPaths) == added and not session.rootPrims
-    return stage if unchanged else _opened(stage, added)
+    return stage if unchanged else _reopened(stage, added)
 
 
 def file_of(stage: Usd.Stage) -> Usd.Stage:
@@ -127,7 +127,7 @@ def file_of(stage: Usd.Stage) -> Usd.Stage:
     return Usd.Stage.Open(stage.GetRootLayer(), None) if stage.GetSessionLayer().subLayerPaths else stage
 
 
-def _opened(stage: Usd.Stage, added: list[str]) -> Usd.Stage:
+def _reopened(stage: Usd.Stage, added: list[str]) -> Usd.Stage:
     if not added:
         return Usd.Stage.Open(stage.GetRootLayer(), None)
     session = Sdf.Layer.CreateAnonymous()

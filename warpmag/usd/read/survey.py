@@ -16,7 +16,7 @@ from warpmag.errors import InputError
 from warpmag.usd.read.clock import scenes, stage_name, unit_findings
 from warpmag.usd.read.coils import PlacedSource, is_source, sources_of
 from warpmag.usd.read.geometry import magnet_findings, mesh_findings, shape_findings, spacing_findings
-from warpmag.usd.read.input_errors import failure
+from warpmag.usd.read.input_errors import first_line
 from warpmag.usd.read.keys import KeyReader, field_keys, magnetization_keys
 from warpmag.usd.read.materials import material_findings
 from warpmag.usd.read.opening import copied_metadata
@@ -91,7 +91,7 @@ def _metadata_findings(stage) -> Iterator[Finding]:
         try:
             root.pseudoRoot.GetInfo(key)
         except (UnicodeDecodeError, Tf.ErrorException) as error:
-            yield Finding(stage_name(stage), f"{key} cannot be read ({failure(error)})")
+            yield Finding(stage_name(stage), f"{key} cannot be read ({first_line(error)})")
 
 
 def _read_prim(prim, transforms, keys, contents) -> None:

@@ -93,12 +93,12 @@ class TransformCheck:
             lineage.append(prim)
             prim = prim.GetParent()
         for prim in reversed(lineage):
-            findings = list(_own_findings(prim))
+            findings = list(_operation_findings(prim))
             self._sound[prim.GetPath()] = not findings and self._sound.get(prim.GetParent().GetPath(), True)
             yield from findings
 
 
-def _own_findings(prim) -> Iterator[Finding]:
+def _operation_findings(prim) -> Iterator[Finding]:
     """Yield errors in the transform operations of one prim."""
     if not prim.IsA(UsdGeom.Xformable):
         return

@@ -19,7 +19,7 @@ from warpmag.declarations.schemas import SCHEMAS
 from warpmag.errors import InputError
 from warpmag.usd.read.session import UNITS, add_layer, new_layer, release_instances
 
-_LENGTH, _NONE = (1, 0), (0, 0)
+_LENGTH, _NO_UNIT = (1, 0), (0, 0)
 _FORCE, _TORQUE = (1, 1), (2, 1)
 _STIFFNESS = (0, 1)
 """Exponents of length and mass in a unit. Damping has the exponents of stiffness."""
@@ -30,7 +30,7 @@ _SIZES = (
     *("horizontalAperture", "verticalAperture", "horizontalApertureOffset", "verticalApertureOffset"),
 )
 """Lengths whose fallback values are in the unit of the stage."""
-_POWERS = {
+_EXPONENTS = {
     **dict.fromkeys(_SIZES, _LENGTH),
     **dict.fromkeys(("points", "extent", "extentsHint", "widths", "primvars:widths"), _LENGTH),
     **dict.fromkeys(("positions", "velocities", "accelerations"), _LENGTH),
@@ -54,16 +54,16 @@ _POWERS = {
     **dict.fromkeys(("newton:vbd:rigid:jointAngularStiffness", "newton:vbd:rigid:jointAngularDamping"), _TORQUE),
     **{row.usd_name: _LENGTH for schema in SCHEMAS for row in schema.attributes if row.unit == "distance"},
 }
-_OF_JOINTS = {
-    **dict.fromkeys(("physics:lowerLimit", "physics:upperLimit"), (_LENGTH, _NONE)),
-    **dict.fromkeys(("newton:velocityLimit", "newton:mimicCoef0"), (_LENGTH, _NONE)),
+_JOINT_EXPONENTS = {
+    **dict.fromkeys(("physics:lowerLimit", "physics:upperLimit"), (_LENGTH, _NO_UNIT)),
+    **dict.fromkeys(("newton:velocityLimit", "newton:mimicCoef0"), (_LENGTH, _NO_UNIT)),
     "newton:armature": ((0, 1), (2, 1)),
     "newton:friction": (_FORCE, _TORQUE),
     **dict.fromkeys(("newton:damping", "newton:limitStiffness", "newton:limitDamping"), (_STIFFNESS, _TORQUE)),
 }
 """Attributes with different units for sliding and for turning joints."""
-_OF_DRIVES = {
-    **dict.fromkeys(("targetPosition", "targetVelocity"), (_LENGTH, _NONE)),
+_DRIVE_EXPONENTS = {
+    **dict.fromkeys(("targetPosition", "targetVelocity"), (_LENGTH, _NO_UNIT)),
     **dict.fromkeys(("stiffness", "damping"), (_STIFFNESS, _TORQUE)),
     "maxForce": (_FORCE, _TORQUE),
 }
@@ -145,38 +145,38 @@ def _converted(prim: Usd.Prim, units: Units) -> Iterator[tuple[_Attribute, float
         attribute = prim.GetAttribute(name)
         if not attribute or not (attribute.HasAuthoredValue() or name in _SIZES):
             continue
-        length, mass = _powers(prim, name)
+        length, mass = _exponents(prim, name)
         scale = units.meters**length * units.kilograms**mass
         if scale != 1.0:
             yield _values(attribute), scale
 
 
-def _powers(prim: Usd.Prim, name: str) -> tuple[int, int]:
+def _exponents(prim: Usd.Prim, name: str) -> tuple[int, int]:
     """Return the exponents of length and mass in the unit of an attribute."""
     if name.startswith(("xformOp:translate", "xformOp:transform")):
         return _LENGTH
-    if name in _POWERS:
-        return _POWERS[name]
+    if name in _EXPONENTS:
+        return _EXPONENTS[name]
     if per_axis := _PER_AXIS.match(name):
-        return _powers_per_axis(prim, *per_axis.groups())
-    if name in _OF_JOINTS:
+        return _exponents_per_axis(prim, *per_axis.groups())
+    if name in _JOINT_EXPONENTS:
         slides, turns = (any(prim.IsA(kind) for kind in kinds) for kinds in (_SLIDING, _TURNING))
         if slides or turns:
-            return _OF_JOINTS[name][0 if slides else 1]
+            return _JOINT_EXPONENTS[name][0 if slides else 1]
     if name.startswith("mjc:") or (
         name.startswith("newton:") and _UNIT.search(prim.GetAttribute(name).GetDocumentation().replace("\n", " "))
     ):
         raise InputError(f"{prim.GetPath()}: {name} is not converted: set metersPerUnit and kilogramsPerUnit to 1")
-    return _NONE
+    return _NO_UNIT
 
 
-def _powers_per_axis(prim, kind: str, axis: str, name: str) -> tuple[int, int]:
+def _exponents_per_axis(prim, kind: str, axis: str, name: str) -> tuple[int, int]:
     slides = axis in ("linear", "distance") or axis.startswith("trans")
     if kind == "limit":
-        return _LENGTH if slides and name in ("low", "high") else _NONE
-    length, mass = _OF_DRIVES.get(name, (_NONE, _NONE))[0 if slides else 1]
+        return _LENGTH if slides and name in ("low", "high") else _NO_UNIT
+    length, mass = _DRIVE_EXPONENTS.get(name, (_NO_UNIT, _NO_UNIT))[0 if slides else 1]
     if name in ("stiffness", "damping") and prim.GetAttribute(f"drive:{axis}:physics:type").Get() == "acceleration":
-        return _NONE  # an acceleration, independent of mass
+        return _NO_UNIT  # an acceleration, independent of mass
     return length, mass
 
 

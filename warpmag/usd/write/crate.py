@@ -101,9 +101,9 @@ class OverLayer:
             ("variability", reference(VARIABILITY, _UNIFORM, _INLINED)),
             ("default", reference(TOKEN, self._place(_counted(map(self._token, tokens))), _ARRAY)),
         )
-        own = self._token(name), self._set(fields)
+        attribute = self._token(name), self._set(fields)
         for path in paths:
-            self._properties_of(path).append(own)
+            self._properties_of(path).append(attribute)
 
     def make_editable(self, path: str) -> None:
         """Set ``instanceable = false`` on a prim."""
@@ -206,19 +206,20 @@ class OverLayer:
         names = {path: self._token(path.rpartition("/")[2]) for path in order}
         tokens, jumps, sets, kinds = list[int](), list[int](), list[int](), list[int]()
         for path in order:
-            own, children = self._properties[path], self._children[path]
-            property_tokens = [token for token, _ in own]
+            properties, children = self._properties[path], self._children[path]
+            property_tokens = [token for token, _ in properties]
             tokens += [names[path], *(-token for token in property_tokens)]
             # offset to the next sibling; -1 for the last with a subtree, 0 without a subtree, -2 for the last without
-            jumps.append((-1 if path in last else sizes[path]) if own or children else (-2 if path in last else 0))
-            jumps += [0] * len(own)
-            if own and not children:
+            if properties or children:
+                jumps.append(-1 if path in last else sizes[path])
+            else:
+                jumps.append(-2 if path in last else 0)
+            jumps += [0] * len(properties)
+            if properties and not children:
                 jumps[-1] = -2
-            sets += [
-                self._prim_set(path, property_tokens, [names[child] for child in children]),
-                *(fields for _, fields in own),
-            ]
-            kinds += [_PRIM, *[_ATTRIBUTE] * len(own)]
+            sets.append(self._prim_set(path, property_tokens, [names[child] for child in children]))
+            sets += [fields for _, fields in properties]
+            kinds += [_PRIM, *[_ATTRIBUTE] * len(properties)]
         tokens[0], kinds[0] = 0, _PSEUDO_ROOT
         numbers, count = _integers(range(len(sets))), struct.pack("<Q", len(sets))
         paths = [count, count, numbers, _integers(tokens), _integers(jumps)]
