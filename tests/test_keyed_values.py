@@ -133,7 +133,7 @@ def test_substeps_that_are_shortened_follow_the_same_keys(tmp_path, device):
     [
         (operations(translate={0: (0, 0, 0), 5: ("nan", 0, 0)}), "/World/Part: xformOp:translate is not finite"),
         (operations(translate={0: (0, 0, 0), 5: None}), "/World/Part: xformOp:translate has no value at time code 5"),
-        (operations(translate={0: (0, 0, 0), 5: (1e12, 0, 0)}), "/World/Part: keyed transform reaches 1e+12, beyond"),
+        (operations(translate={0: (0, 0, 0), 5: (1e12, 0, 0)}), "/World/Part: keyed transform reaches"),
         (operations(scale={0: (1, 1, 1), 5: (2, 2, 2)}), "/World/Part: its scale is keyed"),
         (operations(scale={0: (1, 1, 1), 5: (1, 1, -1)}), "/World/Part: keyed transform"),
         (operations(orient={0: (1, 0, 0, 0), 5: (0, 0, 0, 0)}), "/World/Part: xformOp:orient has a quaternion of zero"),

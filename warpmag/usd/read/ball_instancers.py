@@ -37,7 +37,8 @@ class BallInstancer:
         for balls in groups:
             first, others = balls.bodies()
             paths[balls.rows] = [first, *others]
-            if magnet := _magnet_in(stage, balls):
+            prims = Usd.PrimRange(stage.GetPrimAtPath(balls.first))
+            if magnet := next((prim for prim in prims if has_api(prim, MAGNET_API)), None):
                 prim = str(magnet.GetPath())
                 self.magnets[balls.rows] = [prim, *balls.copies_of(prim)]
                 self.permanent[balls.rows] = magnet.GetAttribute("warpmag:kind").Get() == "permanent"
@@ -99,9 +100,3 @@ def ball_instancers(stage: Usd.Stage, deferred: Sequence[IdenticalBalls]) -> lis
         if balls.stays_instancer:
             groups.setdefault(balls.instancer, []).append(balls)
     return [BallInstancer(stage, group) for group in groups.values()]
-
-
-def _magnet_in(stage: Usd.Stage, balls: IdenticalBalls) -> Usd.Prim | None:
-    """Return the magnet in the instance that has prims."""
-    prims = Usd.PrimRange(stage.GetPrimAtPath(balls.first))
-    return next((prim for prim in prims if has_api(prim, MAGNET_API)), None)

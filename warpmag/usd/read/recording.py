@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Usd, UsdGeom, Vt
+from pxr import Usd, UsdGeom, Vt
 
 from warpmag.declarations.rotations import multiply, rotate
 from warpmag.usd.read.ball_instancers import BallInstancer
@@ -196,9 +196,8 @@ class Playback:
             if prim in balls:
                 row[:] = balls[prim]
                 continue
-            transform = Gf.Transform(cache.GetLocalToWorldTransform(self._stage.GetPrimAtPath(prim)))
-            rotation = transform.GetRotation().GetQuat()
-            row[:] = *transform.GetTranslation(), *rotation.GetImaginary(), rotation.GetReal()
+            matrix = np.array(cache.GetLocalToWorldTransform(self._stage.GetPrimAtPath(prim)))
+            row[:] = *matrix[3, :3], *rotation_of(matrix)
         return poses
 
     def moments(self, prims: Sequence[str]) -> np.ndarray:
