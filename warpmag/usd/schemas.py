@@ -145,16 +145,12 @@ def collider_magnet(collider: Usd.Prim) -> ColliderMagnet | None:
     if prim is None:
         return None
     frames = () if prim == collider else (world_matrix(prim), world_matrix(collider))
-    return ColliderMagnet(magnet_of(prim), frames, _axis(collider))
+    return ColliderMagnet(magnet_of(prim), frames, shape_axis(collider.GetStage(), collider.GetPath()))
 
 
-def shape_axis(stage: Usd.Stage, path: str) -> str | None:
+def shape_axis(stage: Usd.Stage, path: str | Sdf.Path) -> str | None:
     """Return the token of the axis of the capsule, cylinder or cone at a path, None for other shapes."""
-    return _axis(stage.GetPrimAtPath(path))
-
-
-def _axis(prim: Usd.Prim) -> str | None:
-    axis = prim.GetAttribute("axis")
+    axis = stage.GetPrimAtPath(path).GetAttribute("axis")
     return axis.Get() if axis else None
 
 

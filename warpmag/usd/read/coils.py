@@ -65,7 +65,7 @@ def sources_of(prim: Usd.Prim, transforms: TransformCheck, keys: KeyReader) -> I
         return
     faults = list(transforms.findings(prim))
     yield from faults
-    if faults or not transforms.is_sound(prim):
+    if faults or not transforms.is_valid(prim):
         return
     try:
         position, rotation, scale = _frame(prim)

@@ -17,7 +17,7 @@ _AS_DRAWN = ("none", "meshSimplification", "sdf", None)
 
 
 def shape_findings(prim: Usd.Prim) -> Iterator[Finding]:
-    """Yield errors in the size of a collider in the world, and in its mesh."""
+    """Yield errors in the size of a collider in the world, and in its mesh, whose attributes must be valid."""
     if prim.IsA(UsdGeom.Mesh):
         yield from _mesh_findings(prim)
     else:
@@ -82,10 +82,7 @@ def _size_findings(prim, largest) -> Iterator[Finding]:
 
 def _mesh_findings(prim) -> Iterator[Finding]:
     path = str(prim.GetPath())
-    try:
-        points, counts, indices, holes = _topology(prim)
-    except InputError:  # reported with the attributes
-        return
+    points, counts, indices, holes = _topology(prim)
     if points is None or not len(points):
         yield Finding(path, "mesh has no points")
         return

@@ -7,7 +7,7 @@ unchanged. Instancers of very many identical balls stay instancers (``ball_insta
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
@@ -15,7 +15,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 from warpmag.errors import InputError
 from warpmag.usd.read.identical_balls import INSTANCE_ARRAYS, MOMENTS_PRIMVAR, IdenticalBalls, identical_balls
 from warpmag.usd.read.prims import descendants, is_body, is_collider, is_physical
-from warpmag.usd.read.session import INSTANCES, add_layer, new_layer, release, release_instances
+from warpmag.usd.read.session import INSTANCES, add_layer, release, release_instances
 from warpmag.usd.read.trial_read import MOST_PRIMS
 from warpmag.usd.schemas import MAGNET_API, MOMENT, has_api
 
@@ -74,7 +74,6 @@ class _Expansion:
     def __init__(self, stage: Usd.Stage, time_code: float, defer: bool):
         self._stage, self._time = stage, time_code
         self._defer, self.deferred = defer, list[IdenticalBalls]()
-        self._layer: Sdf.Layer | None = None
         self._done: set[Sdf.Path] = set()
         self._prims = 0
 
@@ -95,12 +94,10 @@ class _Expansion:
         self._write(UsdGeom.PointInstancer.Get(self._stage, path), targets)
         self._done.add(path)
 
-    def _layer_of_prims(self) -> Sdf.Layer:
-        """Return the layer of the prims; the first call adds it to the stage."""
-        if self._layer is None:
-            self._layer = new_layer(INSTANCES)
-            add_layer(self._stage, self._layer)
-        return self._layer
+    @cached_property
+    def _layer(self) -> Sdf.Layer:
+        """Layer of the prims; the first use adds it to the stage."""
+        return add_layer(self._stage, INSTANCES)
 
     def _editable(self, path: Sdf.Path) -> Usd.Prim:
         """Return the prim at a path; where it is physical, instances around it become editable."""
@@ -109,7 +106,7 @@ class _Expansion:
                 break
             while not prim.IsInstance():
                 prim = prim.GetParent()
-            release(self._stage, self._layer_of_prims(), [prim.GetPath()])
+            release(self._stage, self._layer, [prim.GetPath()])
         return prim
 
     def _prototype_prim(self, instancer: Sdf.Path, target: Sdf.Path) -> Usd.Prim:
@@ -119,7 +116,7 @@ class _Expansion:
 
     def _write(self, instancer: UsdGeom.PointInstancer, targets) -> None:
         """Write the prims of an instancer's instances, except for deferred ones."""
-        path, layer = instancer.GetPath(), self._layer_of_prims()
+        path, layer = instancer.GetPath(), self._layer
         instances = _Instances(instancer, len(targets), self._time)
         has_velocities = any(len(instances.arrays[name]) for name in _VELOCITIES)
         for target in targets if has_velocities else ():  # they are written to the bodies, also inside instances

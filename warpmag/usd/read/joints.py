@@ -51,25 +51,20 @@ def joint_findings(stage: Usd.Stage, keyed: Container[str] = ()) -> Iterator[Fin
     """Yield errors in the joints of a stage; ``keyed`` are paths of bodies that keys move."""
     transforms = TransformCheck()
     for joint in enabled_joints(stage):
-        path = str(joint.GetPath())
-        for end in _ends(stage, joint):
+        path, ends = str(joint.GetPath()), _ends(stage, joint)
+        for end in ends:
             if end.prim:
                 yield from transforms.findings(end.prim)
+        carrier = str(ends[1].body.GetPath()) if ends[1].body else ""
         if problem := _problem(stage, joint):
             yield Finding(path, problem)
-        elif keyed and (carrier := _second_body(stage, joint)) in keyed:
+        elif ends[0].moves and carrier in keyed:
             message = "and Newton would hold it still: name it as physics:body0"
             yield Finding(path, f"its physics:body1 {carrier} is moved by keys, {message}")
-        elif not any(end.moves for end in _ends(stage, joint)):
+        elif not any(end.moves for end in ends):
             yield Finding(path, "joins two fixed ends, and is left out", "warning")
     for path, gap in _strained_joints(stage).items():
         yield Finding(path, f"its ends are {joint_gap_message(gap)}", "warning")
-
-
-def _second_body(stage, joint) -> str:
-    """Return the path of ``physics:body1`` of a joint whose ``body0`` is dynamic, else an empty path."""
-    first, second = _ends(stage, joint)
-    return str(second.body.GetPath()) if first.moves and second.body else ""
 
 
 def _strained_joints(stage: Usd.Stage) -> dict[str, float]:

@@ -17,17 +17,13 @@ INSTANCES, UNITS = "warpmag_instances", "warpmag_units"
 """Names of the layers."""
 
 
-def add_layer(stage: Usd.Stage, layer: Sdf.Layer) -> None:
-    """Insert a layer directly below the session layer of a stage."""
-    session = stage.GetSessionLayer()
+def add_layer(stage: Usd.Stage, name: str) -> Sdf.Layer:
+    """Insert an empty layer directly below the session layer of a stage; :func:`added_layer` finds it by its name."""
+    session, layer = stage.GetSessionLayer(), Sdf.Layer.CreateAnonymous(f"{name}.usda")
     for target in (session, layer):  # USD would rescale its time samples otherwise
         target.timeCodesPerSecond = stage.GetTimeCodesPerSecond()
     session.subLayerPaths.insert(0, layer.identifier)
-
-
-def new_layer(name: str) -> Sdf.Layer:
-    """Return an empty layer that :func:`added_layer` can find by its name."""
-    return Sdf.Layer.CreateAnonymous(f"{name}.usda")
+    return layer
 
 
 def added_layer(stage: Usd.Stage, name: str) -> Sdf.Layer | None:

@@ -103,7 +103,7 @@ def _read_prim(prim, transforms, keys, contents) -> None:
         contents.bodies.append(path)
         if UsdPhysics.RigidBodyAPI(prim).GetKinematicEnabledAttr().Get():
             contents.kinematic.append(path)
-            faults += _read_motion(prim, keys, contents) if transforms.is_sound(prim) and not faults else ()
+            faults += _read_motion(prim, keys, contents) if transforms.is_valid(prim) and not faults else ()
     if collider:
         contents.colliders.append(path)
         owner = None if body else body_of(prim)
@@ -111,7 +111,7 @@ def _read_prim(prim, transforms, keys, contents) -> None:
             message = f"keys move it within its rigid body {owner.GetPath()}, which keeps its shape"
             contents.findings.append(Finding(path, message, "warning"))
     faults += attribute_findings(prim, shape=body or collider)
-    if collider and not faults and transforms.is_sound(prim):
+    if collider and not faults and transforms.is_valid(prim):
         faults += shape_findings(prim)
     elif prim.IsA(UsdGeom.Mesh) and not collider:
         faults += mesh_findings(prim)
@@ -170,14 +170,14 @@ def _read_magnet(prim, transforms, keys, contents) -> None:
     except InputError as error:
         contents.findings.append(finding_of(path, error))
     faulty = {finding.where for finding in contents.findings if finding.severity == "error"}
-    sound = [
+    valid_parts = [
         part
         for part in prims_of_magnet(prim)
-        if is_collider(part) and is_solid(part) and str(part.GetPath()) not in faulty and transforms.is_sound(part)
+        if is_collider(part) and is_solid(part) and str(part.GetPath()) not in faulty and transforms.is_valid(part)
     ]
-    contents.findings += [finding for part in sound for finding in magnet_findings(part)]
+    contents.findings += [finding for part in valid_parts for finding in magnet_findings(part)]
     if path in contents.magnets and path not in faulty:
-        contents.findings += spacing_findings(prim, sound, contents.magnets[path].moment_spacing)
+        contents.findings += spacing_findings(prim, valid_parts, contents.magnets[path].moment_spacing)
 
 
 def _read_sources(prim, transforms, keys, contents) -> None:

@@ -68,12 +68,12 @@ class TransformCheck:
     def __init__(self):
         """Create a check without results."""
         self._cache = UsdGeom.XformCache(Usd.TimeCode.Default())
-        self._sound = {}
+        self._valid = {}
 
     def findings(self, prim: Usd.Prim) -> Iterator[Finding]:
         """Yield errors in the transform of a body or collider, including its parents' transforms."""
         yield from self._lineage_findings(prim)
-        if not self.is_sound(prim):
+        if not self.is_valid(prim):
             return
         path, world = str(prim.GetPath()), np.array(self._cache.GetLocalToWorldTransform(prim))
         fault, comment = rigid_fault(world, may_mirror=not is_body(prim))
@@ -83,18 +83,18 @@ class TransformCheck:
         elif prim.IsA(UsdGeom.Sphere) and np.abs(squares - squares.mean()).max() > SCALE_TOLERANCE * squares.mean():
             yield Finding(path, "a sphere with non-uniform scale would be imported as a ball: make it a mesh")
 
-    def is_sound(self, prim: Usd.Prim) -> bool:
+    def is_valid(self, prim: Usd.Prim) -> bool:
         """Return whether :meth:`findings` was called for a prim, and USD can compose its transform."""
-        return self._sound.get(prim.GetPath(), False)
+        return self._valid.get(prim.GetPath(), False)
 
     def _lineage_findings(self, prim) -> Iterator[Finding]:
         lineage = []
-        while not prim.IsPseudoRoot() and prim.GetPath() not in self._sound:
+        while not prim.IsPseudoRoot() and prim.GetPath() not in self._valid:
             lineage.append(prim)
             prim = prim.GetParent()
         for prim in reversed(lineage):
             findings = list(_operation_findings(prim))
-            self._sound[prim.GetPath()] = not findings and self._sound.get(prim.GetParent().GetPath(), True)
+            self._valid[prim.GetPath()] = not findings and self._valid.get(prim.GetParent().GetPath(), True)
             yield from findings
 
 

@@ -17,7 +17,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, Vt
 
 from warpmag.declarations.schemas import SCHEMAS
 from warpmag.errors import InputError
-from warpmag.usd.read.session import UNITS, add_layer, new_layer, release_instances
+from warpmag.usd.read.session import UNITS, add_layer, release_instances
 
 _LENGTH, _NO_UNIT = (1, 0), (0, 0)
 _FORCE, _TORQUE = (1, 1), (2, 1)
@@ -91,7 +91,7 @@ class Units:
         return math.isclose(self.meters, 1.0) and math.isclose(self.kilograms, 1.0)
 
     @property
-    def are_sound(self) -> bool:
+    def are_valid(self) -> bool:
         """True for units that can be converted."""
         return all(1e-50 < unit < 1e50 for unit in (self.meters, self.kilograms))
 
@@ -112,10 +112,9 @@ def convert_units(stage: Usd.Stage) -> None:
     Instances become editable, as each needs its own converted values.
     """
     units = units_of(stage)
-    if units.are_si or not units.are_sound:
+    if units.are_si or not units.are_valid:
         return
-    layer = new_layer(UNITS)
-    add_layer(stage, layer)
+    layer = add_layer(stage, UNITS)
     release_instances(stage, layer, stage.GetPseudoRoot().GetPath())
     # read everything before writing: referenced values would be converted twice
     everywhere = Usd.PrimRange(stage.GetPseudoRoot(), Usd.PrimAllPrimsPredicate)

@@ -114,10 +114,10 @@ class CacheWriter:
         self._output = Output(path, scene, copy_scene=self._copy_scene)
         self._rows = _Rows(body_paths, magnet_paths, instancers)
         self._bodies = Placements(stage, [body_paths[row] for row in self._rows.bodies.tolist()], self._units.meters)
-        self._magnet_paths = [magnet_paths[row] for row in self._rows.magnets.tolist()]
+        magnets_with_prims = [magnet_paths[row] for row in self._rows.magnets.tolist()]
         self._instancer_paths = [instancer.path for instancer in instancers]
         self._instancers = [InstancerFrames(instancer) for instancer in instancers]
-        self._columns = [Column(kind, self._bodies.paths) for kind in BODY] + [Column(MAGNET, self._magnet_paths)]
+        self._columns = [Column(kind, self._bodies.paths) for kind in BODY] + [Column(MAGNET, magnets_with_prims)]
         self._columns += [column for instancer in self._instancers for column in instancer.columns]
         self._frames, self._options = frames, options or {}
         self._samples: SampleFile | None = None
