@@ -123,6 +123,10 @@ REFUSED = {
         "/Ball: transform is a projection",
     ),
     "index beyond the points": (mesh(changed(5, 20)), "/Ball: faceVertexIndices name point 20, but there are points 0"),
+    "index beyond the points of a prim with a warning": (
+        mesh(changed(5, 20), more="float physics:staticFriction = 1"),
+        "/Ball: faceVertexIndices name point 20",
+    ),
     "negative index": (mesh(changed(0, -1)), "/Ball: faceVertexIndices name point -1"),
     "face of two": (mesh(CORNERS, (3, 3, 2, 4)), "/Ball: faceVertexCounts must be 3 or more, got 2"),
     "negative count": (mesh(CORNERS, (3, 3, -3, 9)), "/Ball: faceVertexCounts must be 3 or more, got -3"),

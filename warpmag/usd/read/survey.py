@@ -111,7 +111,8 @@ def _read_prim(prim, transforms, keys, contents) -> None:
             message = f"keys move it within its rigid body {owner.GetPath()}, which keeps its shape"
             contents.findings.append(Finding(path, message, "warning"))
     faults += attribute_findings(prim, shape=body or collider)
-    if collider and not faults and transforms.is_valid(prim):
+    has_errors = any(fault.severity == "error" for fault in faults)
+    if collider and not has_errors and transforms.is_valid(prim):
         faults += shape_findings(prim)
     elif prim.IsA(UsdGeom.Mesh) and not collider:
         faults += mesh_findings(prim)
