@@ -121,12 +121,14 @@ def value_of(prim: Usd.Prim, name: str):
         value = attribute.Get()
     except Tf.ErrorException:
         raise InputError(f"{prim.GetPath()}: {name} has a value that USD cannot read") from None
-    example, fallback = _expected(prim, attribute)
+    fallback = prim.GetPrimDefinition().GetAttributeFallbackValue(name)
+    if fallback is None:
+        fallback = _defaults_by_name().get(name)
     if value is None and fallback is not None:
         raise InputError(f"{prim.GetPath()}: {name} is blocked and has no value")
     if value is None or not attribute.HasAuthoredValue():
         return value
-    check_type(prim, name, value, example)
+    check_type(prim, name, value, declared(attribute) if fallback is None else fallback)
     if name in _TOKENS and value not in _TOKENS[name]:
         raise InputError(f"{prim.GetPath()}: {name} must be one of {', '.join(_TOKENS[name])}, got {_shown(value)}")
     _check_numbers(prim, name, value, fallback)
@@ -274,15 +276,6 @@ def _defaults(schema: str) -> dict[str, object]:
     definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(schema)
     names = definition.GetPropertyNames() if definition else ()
     return {name: definition.GetAttributeFallbackValue(name) for name in names}
-
-
-def _expected(prim, attribute):
-    """Return a value of the right type for an attribute, and the schema's default or None."""
-    name = attribute.GetName()
-    fallback = prim.GetPrimDefinition().GetAttributeFallbackValue(name)
-    if fallback is None:
-        fallback = _defaults_by_name().get(name)
-    return (declared(attribute) if fallback is None else fallback), fallback
 
 
 def _check_numbers(prim, name, value, fallback) -> None:

@@ -138,7 +138,8 @@ def _read(prim: Usd.Prim, schema: Schema) -> dict:
     for row in schema.attributes:
         if not (attribute := prim.GetAttribute(row.usd_name)):
             continue
-        if row.uniform and _changes(attribute):
+        specs = attribute.GetPropertyStack()  # those below a frozen value too
+        if row.uniform and any(spec.layer.GetNumTimeSamplesForPath(spec.path) > 1 for spec in specs):
             raise InputError(f"{prim.GetPath()}: {row.usd_name} has time samples, but cannot change")
         if finding := instance_finding(attribute):
             raise InputError(str(finding))
@@ -150,11 +151,6 @@ def _current(name: str, value) -> tuple[float]:
     current = number(name, value)
     check_strength(name, current)
     return (current,)
-
-
-def _changes(attribute: Usd.Attribute) -> bool:
-    """Return whether a layer has several time samples for an attribute, even below a frozen value."""
-    return any(spec.layer.GetNumTimeSamplesForPath(spec.path) > 1 for spec in attribute.GetPropertyStack())
 
 
 def _scaled(source: Source, scale: float) -> Source:

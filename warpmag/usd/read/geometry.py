@@ -48,10 +48,8 @@ def spacing_findings(magnet: Usd.Prim, colliders: list[Usd.Prim], spacing: float
         lower, upper = UsdGeom.Boundable.ComputeExtentFromPlugins(UsdGeom.Boundable(prim), Usd.TimeCode.Default())
         boxes.append(np.subtract(upper, lower).astype(float) * np.linalg.norm(_axes(prim), axis=1))
     if not lattice.fits(boxes, spacing):
-        yield Finding(
-            str(magnet.GetPath()),
-            f"warpmag:momentSpacing {spacing:g} m needs more than {lattice.LARGEST_COUNT} moments for one body",
-        )
+        message = f"warpmag:momentSpacing {spacing:g} m needs more than {lattice.LARGEST_COUNT} moments for one body"
+        yield Finding(str(magnet.GetPath()), message)
 
 
 def mesh_findings(prim: Usd.Prim) -> Iterator[Finding]:
@@ -73,11 +71,8 @@ def _size_findings(prim, largest) -> Iterator[Finding]:
     lengths = np.linalg.norm(_axes(prim), axis=1)
     for name, size in zip(_SIZES, sizes, strict=False):
         if size is not None and not (SMALLEST_SIZE <= size * lengths.min() and size * lengths.max() <= largest):
-            yield Finding(
-                str(prim.GetPath()),
-                f"{name} {size:g} scaled by {lengths.min():g} to {lengths.max():g} must be from {SMALLEST_SIZE:g} "
-                f"to {largest:g} m",
-            )
+            scaled = f"{name} {size:g} scaled by {lengths.min():g} to {lengths.max():g}"
+            yield Finding(str(prim.GetPath()), f"{scaled} must be from {SMALLEST_SIZE:g} to {largest:g} m")
 
 
 def _mesh_findings(prim) -> Iterator[Finding]:

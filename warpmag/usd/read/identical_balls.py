@@ -163,13 +163,7 @@ def identical_balls(
 ) -> Iterator[IdenticalBalls]:
     """Yield groups of two or more identical balls of an instancer; none unless units are SI and arrays are finite.
 
-    Args:
-        instancer: The instancer.
-        time_code: Time code of the arrays.
-        paths: Paths of the instances.
-        rows: Row of each instance in the arrays.
-        kinds: Prototype and scale of each instance, shape [n, 1] or [n, 4].
-        arrays: Arrays of the instancer.
+    Each of n instances has a path, a row in the arrays, and a kind: its prototype and scale, shape [n, 1] or [n, 4].
     """
     stage = instancer.GetPrim().GetStage()
     finite = all(np.isfinite(values).all() for values in arrays.values())

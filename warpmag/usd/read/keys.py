@@ -55,7 +55,8 @@ class KeyReader:
         for parent in lineage(self.unfrozen.GetPrimAtPath(prim.GetPath())):
             if parent.IsA(UsdGeom.Xformable):
                 xform = UsdGeom.Xformable(parent)
-                operations = [*_without_identities([_operation(op) for op in xform.GetOrderedXformOps()]), *operations]
+                stack = map(_operation, xform.GetOrderedXformOps())
+                operations = [*(operation for operation in stack if not _is_identity(operation)), *operations]
                 if xform.GetResetXformStack():
                     break
         return Motion(tuple(operations))
@@ -186,14 +187,10 @@ def _operation(xform: UsdGeom.XformOp) -> Operation:
     return Operation(kind, rows, xform.IsInverseOp())
 
 
-def _without_identities(operations: list[Operation]) -> list[Operation]:
-    """Return operations other than constant identities."""
-
-    def is_identity(operation: Operation) -> bool:
-        neutral = {"translate": np.zeros(3), "scale": np.ones(3), "matrix": np.eye(4).ravel()}.get(operation.kind)
-        return neutral is not None and bool((operation.keys.values == neutral).all())
-
-    return [operation for operation in operations if not is_identity(operation)]
+def _is_identity(operation: Operation) -> bool:
+    """Return whether an operation is the identity at all keys."""
+    neutral = {"translate": np.zeros(3), "scale": np.ones(3), "matrix": np.eye(4).ravel()}.get(operation.kind)
+    return neutral is not None and bool((operation.keys.values == neutral).all())
 
 
 def field_keys(prim: Usd.Prim, keys: KeyReader) -> Keys | None:

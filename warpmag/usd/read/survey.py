@@ -154,9 +154,8 @@ def _read_magnet(prim, transforms, keys, contents) -> None:
     path = str(prim.GetPath())
     body, collider = is_body(prim), is_collider(prim)
     if not (body or collider):
-        contents.findings.append(
-            Finding(path, f"{MAGNET_API} on a prim that is neither an enabled rigid body nor an enabled collider")
-        )
+        message = f"{MAGNET_API} on a prim that is neither an enabled rigid body nor an enabled collider"
+        contents.findings.append(Finding(path, message))
     elif not any(is_collider(part) and is_solid(part) for part in prims_of_magnet(prim)):
         contents.findings.append(Finding(path, "a magnet without colliders that are solid: no shape to magnetize"))
     elif not body and (owner := body_of(prim)) and has_api(owner, MAGNET_API):

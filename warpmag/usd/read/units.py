@@ -118,28 +118,17 @@ def convert_units(stage: Usd.Stage) -> None:
     release_instances(stage, layer, stage.GetPseudoRoot().GetPath())
     # read everything before writing: referenced values would be converted twice
     everywhere = Usd.PrimRange(stage.GetPseudoRoot(), Usd.PrimAllPrimsPredicate)
-    converted = [pair for prim in everywhere for pair in _converted(prim, units)]
+    converted = [values for prim in everywhere for values in _converted(prim, units)]
     with Sdf.ChangeBlock():
-        for attribute, scale in converted:
-            _write(layer, attribute, scale)
+        for attribute, default, samples in converted:
+            _write(layer, attribute, default, samples)
     session = stage.GetSessionLayer().pseudoRoot
     session.SetInfo("metersPerUnit", 1.0)
     session.SetInfo("kilogramsPerUnit", 1.0)
 
 
-@dataclass(frozen=True)
-class _Attribute:
-    """An attribute with its values before the conversion."""
-
-    path: Sdf.Path
-    kind: Sdf.ValueTypeName
-    variability: Sdf.Variability
-    default: object
-    samples: tuple[tuple[float, object], ...]
-
-
-def _converted(prim: Usd.Prim, units: Units) -> Iterator[tuple[_Attribute, float]]:
-    """Yield the attributes of a prim to convert, with their factors."""
+def _converted(prim: Usd.Prim, units: Units) -> Iterator[tuple[Usd.Attribute, object, list[tuple[float, object]]]]:
+    """Yield attributes of a prim, with their converted defaults and time samples; None for types without a unit."""
     for name in prim.GetPropertyNames():
         attribute = prim.GetAttribute(name)
         if not attribute or not (attribute.HasAuthoredValue() or name in _SIZES):
@@ -147,7 +136,8 @@ def _converted(prim: Usd.Prim, units: Units) -> Iterator[tuple[_Attribute, float
         length, mass = _exponents(prim, name)
         scale = units.meters**length * units.kilograms**mass
         if scale != 1.0:
-            yield _values(attribute), scale
+            default, samples = _values(attribute)
+            yield attribute, _scaled(default, scale), [(time, _scaled(value, scale)) for time, value in samples]
 
 
 def _exponents(prim: Usd.Prim, name: str) -> tuple[int, int]:
@@ -179,33 +169,30 @@ def _exponents_per_axis(prim, kind: str, axis: str, name: str) -> tuple[int, int
     return length, mass
 
 
-def _values(attribute: Usd.Attribute) -> _Attribute:
-    """Return the values of an attribute, or none where USD cannot read them; the survey reports this later."""
-    path = attribute.GetPath()
+def _values(attribute: Usd.Attribute) -> tuple[object, list[tuple[float, object]]]:
+    """Return default and time samples, or none where USD cannot read them; the survey reports this later."""
     if attribute.HasSpline():
-        where = f"{path.GetPrimPath()}: {attribute.GetName()}"
+        where = f"{attribute.GetPrim().GetPath()}: {attribute.GetName()}"
         raise InputError(f"{where} is a spline, which is not converted from other units: bake it into time samples")
     try:
-        samples = tuple((time, attribute.Get(time)) for time in attribute.GetTimeSamples())
-        default = attribute.Get()
+        samples = [(time, attribute.Get(time)) for time in attribute.GetTimeSamples()]
+        return attribute.Get(), samples
     except Tf.ErrorException:
-        samples, default = (), None
-    return _Attribute(path, attribute.GetTypeName(), attribute.GetVariability(), default, samples)
+        return None, []
 
 
-def _write(layer: Sdf.Layer, attribute: _Attribute, scale: float) -> None:
-    """Write the converted values of an attribute; types that cannot be scaled are skipped."""
-    default = _scaled(attribute.default, scale)
-    samples = [(time, _scaled(value, scale)) for time, value in attribute.samples]
-    if (default is None and not samples) or not attribute.kind:
+def _write(layer: Sdf.Layer, attribute: Usd.Attribute, default, samples: list[tuple[float, object]]) -> None:
+    """Write converted values of an attribute."""
+    path, kind = attribute.GetPath(), attribute.GetTypeName()
+    if (default is None and not samples) or not kind:
         return
-    kind = _PRECISE.get(attribute.kind, attribute.kind)
-    if not Sdf.JustCreatePrimAttributeInLayer(layer, attribute.path, kind, attribute.variability, False):
+    kind = _PRECISE.get(kind, kind)
+    if not Sdf.JustCreatePrimAttributeInLayer(layer, path, kind, attribute.GetVariability(), False):
         return
     if default is not None:
-        layer.GetAttributeAtPath(attribute.path).default = default
+        layer.GetAttributeAtPath(path).default = default
     for time, value in samples:
-        layer.SetTimeSample(attribute.path, time, Sdf.ValueBlock() if value is None else value)
+        layer.SetTimeSample(path, time, Sdf.ValueBlock() if value is None else value)
 
 
 def _scaled(value, scale: float):

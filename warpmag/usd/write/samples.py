@@ -68,13 +68,9 @@ class SampleFile:
 
     @classmethod
     def begin(cls, path: str | os.PathLike, layer: LayerFile, sizes: np.ndarray, frames: int | None) -> "SampleFile":
-        """Create a file, which must not exist, with a layer and space for samples.
+        """Create a file, which must not exist, with a layer and space for the expected number of frames.
 
-        Args:
-            path: The file.
-            layer: The layer.
-            sizes: Size of a value of each attribute [bytes], in the order of a frame, shape [attributes].
-            frames: Expected number of frames; there may be more.
+        ``sizes`` are those of a value of each attribute [bytes], in the order of a frame, shape [attributes].
         """
         with contextlib.ExitStack() as stack:
             file = stack.enter_context(open(path, "x+b", buffering=0))
@@ -117,12 +113,9 @@ class SampleFile:
         return {name: np.asarray(value) for name, value in asdict(self._places).items()}
 
     def append(self, code: float, values: bytes, changed: np.ndarray) -> None:
-        """Append a frame with a time code greater than the last one; after an error the frame is not in the file.
+        """Append the values of all attributes at a time code greater than the last; after an error they are not there.
 
-        Args:
-            code: The time code.
-            values: Values of all attributes, contiguous.
-            changed: Attributes without samples whose value now differs from the first frame, shape [n].
+        ``changed`` are attributes without samples whose value now differs from the first frame, shape [n].
         """
         if self.count == self._places.capacity:
             self._extend(os.fstat(self._file.fileno()).st_size, 2 * self.count, _Structure.read(self._file))
