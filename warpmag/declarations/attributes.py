@@ -45,10 +45,8 @@ class Attribute:
     @property
     def documentation(self) -> str:
         """Text of the USD schema: meaning, range and unit."""
-        lines = [self.doc, f"\nRange: {self.range}" if self.range else "", f"Units: {self.unit}" if self.unit else ""]
-        if self.unit and not self.range:
-            lines[2] = f"\n{lines[2]}"
-        return "\n".join(line for line in lines if line)
+        details = [f"{name}: {text}" for name, text in (("Range", self.range), ("Units", self.unit)) if text]
+        return "\n".join([self.doc, "", *details] if details else [self.doc])
 
     def check_value(self, owner: str, value: Any) -> None:
         """Raise :class:`InputError` if ``value`` is invalid; the message names the owner and the field."""

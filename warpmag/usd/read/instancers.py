@@ -131,9 +131,8 @@ class _Expansion:
         if self._defer and not samples:
             groups = list(identical_balls(instancer, self._time, *instances.kinds(f"{path}/{prefix}")))
         without_prims = {row for balls in groups if balls.stays_instancer for row in balls.rows.tolist()}
-        self._prims += sum(
-            1 + prototypes[instances.prototypes[row]].prims for row in instances.rows if row not in without_prims
-        )
+        kinds = [instances.prototypes[row] for row in instances.rows if row not in without_prims]
+        self._prims += sum(1 + prototypes[kind].prims for kind in kinds)
         if self._prims > MOST_PRIMS:
             raise InputError(f"{path}: instances of bodies expand to more than {MOST_PRIMS} prims")
         later = [balls.rows[1:].tolist() for balls in groups]

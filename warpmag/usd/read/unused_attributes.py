@@ -30,8 +30,7 @@ def stray_findings(prim: Usd.Prim) -> Iterator[Finding]:
             continue
         schema = _SCHEMA_OF.get(name)
         if schema is None:
-            message = f"{name} has no effect: no schema has it{_nearest(name, list(_SCHEMA_OF))}"
-            yield Finding(path, message, "warning")
+            yield Finding(path, f"{name} has no effect: no schema has it{_nearest(name, list(_SCHEMA_OF))}", "warning")
         elif not has_api(prim, schema):
             yield Finding(path, f"{name} has no effect: the prim has no {schema}", "warning")
 
@@ -43,8 +42,7 @@ def kind_findings(prim: Usd.Prim, magnet: Magnet, *, keyed: bool) -> Iterator[Fi
     """
     path = str(prim.GetPath())
     if magnet.kind == "permanent" and not (keyed or any(magnet.magnetization)):
-        message = "a permanent magnet without magnetization: author warpmag:magnetization"
-        yield Finding(path, message, "warning")
+        yield Finding(path, "a permanent magnet without magnetization: author warpmag:magnetization", "warning")
     if magnet.kind == "inducible":
         for row in attributes_of(Magnet):
             used = getattr(magnet, row.field) != row.default or (keyed and row.field == "magnetization")
