@@ -75,7 +75,9 @@ def sources_of(prim: Usd.Prim, transforms: TransformCheck, keys: KeyReader) -> I
             yield Finding(path, f"keys move it within its rigid body {body}: a run holds it still there", "warning")
         if has_api(prim, COIL_SCHEMA.name):
             currents = keys.keys(prim, _AMPERE_TURNS, _current)
-            yield PlacedSource(path, _scaled(coil_of(prim), scale), body, position, rotation, currents)
+            coil = Coil(**_read(prim, COIL_SCHEMA))
+            coil.check(path)
+            yield PlacedSource(path, _scaled(coil, scale), body, position, rotation, currents)
         if has_api(prim, FIELD_MAP_SCHEMA.name):
             field_map = field_map_of(prim)
             if (ratio := field_map.border_ratio()) > _BORDER_WARNING:
@@ -106,13 +108,6 @@ def placed_sources(prim: Usd.Prim) -> list[PlacedSource]:
 def world_matrix_at(prim: Usd.Prim, path: str) -> np.ndarray:
     """Return the world matrix of the prim at a path of the stage of ``prim``, for row vectors, shape [4, 4]."""
     return world_matrix(prim.GetStage().GetPrimAtPath(path))
-
-
-def coil_of(prim: Usd.Prim) -> Coil:
-    """Return the coil that ``prim`` declares, in its own frame; raise :class:`InputError` where it is invalid."""
-    coil = Coil(**_read(prim, COIL_SCHEMA))
-    coil.check(str(prim.GetPath()))
-    return coil
 
 
 def field_map_of(prim: Usd.Prim) -> FieldMap:

@@ -21,7 +21,7 @@ COMPACT_COUNT = 5_000
 MOMENTS_PRIMVAR = "primvars:warpmag:moment"
 """Moments of instances [A·m²], world frame."""
 INSTANCE_ARRAYS = {"positions": 3, "orientations": 4, "velocities": 3, "angularVelocities": 3, MOMENTS_PRIMVAR: 3}
-"""Arrays with one value for each instance, and the numbers in a value."""
+"""Arrays with one value for each instance, and the numbers in a value; quaternions are (x, y, z, w)."""
 _SCHEMAS = {"PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI", "MaterialBindingAPI", MAGNET_API}
 """API schemas of a ball that can be copied: none refers to other prims, except for a material."""
 _REFERRING = (UsdPhysics.Joint, UsdPhysics.CollisionGroup)

@@ -136,9 +136,8 @@ class _Expansion:
         if self._prims > MOST_PRIMS:
             raise InputError(f"{path}: instances of bodies expand to more than {MOST_PRIMS} prims")
         later = [balls.rows[1:].tolist() for balls in groups]
-        self.deferred += [
-            replace(balls, create_prims=partial(write, rows)) for balls, rows in zip(groups, later, strict=True)
-        ]
+        for balls, rows in zip(groups, later, strict=True):
+            self.deferred.append(replace(balls, create_prims=partial(write, rows)))
         with Sdf.ChangeBlock():
             root = Sdf.CreatePrimInLayer(layer, path)
             root.typeName = "Xform"

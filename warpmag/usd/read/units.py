@@ -99,11 +99,8 @@ class Units:
 def units_of(stage: Usd.Stage) -> Units:
     """Return the units of a stage's file, before any conversion."""
     root = stage.GetRootLayer().pseudoRoot
-    defaults = (
-        ("metersPerUnit", UsdGeom.LinearUnits.centimeters),
-        ("kilogramsPerUnit", UsdPhysics.MassUnits.kilograms),
-    )
-    return Units(*(float(root.GetInfo(name)) if root.HasInfo(name) else default for name, default in defaults))
+    defaults = {"metersPerUnit": UsdGeom.LinearUnits.centimeters, "kilogramsPerUnit": UsdPhysics.MassUnits.kilograms}
+    return Units(*(float(root.GetInfo(name) if root.HasInfo(name) else unit) for name, unit in defaults.items()))
 
 
 def convert_units(stage: Usd.Stage) -> None:

@@ -11,6 +11,7 @@ Format: https://github.com/PixarAnimationStudios/OpenUSD, ``pxr/usd/usd/crateFil
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import starmap
 
 import numpy as np
 
@@ -73,11 +74,16 @@ class OverLayer:
         self._editable, self._vectors = set[str](), dict[tuple[int, ...], int]()
 
     def set_metadata(self, name: str, value: float | str | dict) -> None:
-        """Set metadata of the layer."""
-        field_value = self._reference_to(value)
+        """Set metadata of the layer; texts become tokens, in dictionaries strings."""
+        if isinstance(value, str):
+            value_reference = self._token_reference(value)
+        elif isinstance(value, dict):
+            value_reference = self._dictionary(value)
+        else:
+            value_reference = reference(DOUBLE, self._place(struct.pack("<d", value)))
         if name == "endTimeCode":
             self._end_code = len(self._values) - 8
-        self._metadata.append(self._field(name, field_value))
+        self._metadata.append(self._field(name, value_reference))
 
     def add_sampled(self, paths: Sequence[str], name: str, type_name: str, kind: int) -> None:
         """Add an attribute with time samples to prims; for an array such as ``quatf[]``, ``kind`` is its element."""
@@ -92,7 +98,7 @@ class OverLayer:
         """Add a constant attribute of type ``double3`` to a prim; ``value`` has shape [3]."""
         place = self._place(np.asarray(value, dtype="<f8").tobytes())
         fields = (("typeName", self._token_reference("double3")), ("default", reference(VEC3D, place)))
-        self._properties_of(path).append((self._token(name), self._set(fields)))
+        self._properties_of(path).append((self._token(name), self._set(starmap(self._field, fields))))
 
     def add_tokens(self, paths: Iterable[str], name: str, tokens: Sequence[str]) -> None:
         """Add a uniform attribute of type ``token[]`` to prims."""
@@ -101,7 +107,7 @@ class OverLayer:
             ("variability", reference(VARIABILITY, _UNIFORM, _INLINED)),
             ("default", reference(TOKEN, self._place(_counted(map(self._token, tokens))), _ARRAY)),
         )
-        attribute = self._token(name), self._set(fields)
+        attribute = self._token(name), self._set(starmap(self._field, fields))
         for path in paths:
             self._properties_of(path).append(attribute)
 
@@ -151,14 +157,6 @@ class OverLayer:
         self._values += data
         return place
 
-    def _reference_to(self, value: float | str | dict) -> int:
-        """Return a reference to metadata; texts become tokens, in dictionaries strings."""
-        if isinstance(value, str):
-            return self._token_reference(value)
-        if isinstance(value, dict):
-            return self._dictionary(value)
-        return reference(DOUBLE, self._place(struct.pack("<d", value)))
-
     def _dictionary(self, value: dict[str, str | dict]) -> int:
         data = struct.pack("<Q", len(value))
         for key, item in value.items():
@@ -171,11 +169,8 @@ class OverLayer:
         """Return the number of a field; fields of sampled attributes come first."""
         return self._fields.setdefault((self._token(name), value), 2 * len(self._sizes) + len(self._fields))
 
-    def _set(self, fields: Iterable[tuple[str, int]]) -> int:
-        """Return the index at which a set of fields begins, given as names and references."""
-        return self._set_of([self._field(*field) for field in fields])
-
-    def _set_of(self, fields: Sequence[int]) -> int:
+    def _set(self, fields: Iterable[int]) -> int:
+        """Return the index at which a set of fields begins."""
         key = tuple(fields)
         if key not in self._sets:
             self._sets[key] = self._next_set
@@ -233,7 +228,7 @@ class OverLayer:
         for name, tokens in (("properties", properties), ("primChildren", children)):
             if tokens:
                 fields.append(self._field(name, self._token_vector(tuple(tokens))))
-        return self._set_of(fields)
+        return self._set(fields)
 
     def _token_vector(self, tokens: tuple[int, ...]) -> int:
         if tokens not in self._vectors:
