@@ -113,8 +113,8 @@ def prepare_joints(stage: Usd.Stage, *, articulations: bool = True) -> list[Grou
 
     Joints with a kinematic ``body1`` are attached to the world, joints between two fixed ends are disabled, and the
     unlimited axes of a generic joint get explicit infinite limits. Solvers in generalized coordinates need
-    ``articulations``: Newton then accepts only trees from parent to child that contain all their bodies, without them
-    any graph of joints.
+    ``articulations``. Newton then accepts only trees from parent to child that contain all their bodies. Without
+    articulations it accepts any graph of joints.
 
     Returns:
         The joints between a dynamic body and a fixed end, except for kinematic bodies as ``body0``.
