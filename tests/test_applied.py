@@ -203,7 +203,7 @@ def test_a_map_is_exact_for_parabolas_and_its_gradient_is_its_own(device):
     assert h[4].any()
 
 
-PUSHED = LOOP._replace(world=0, body=50, pushed=True)
+PUSHED = LOOP._replace(world=0, body=50, movable=True)
 
 
 def make_loaded_system(device, source=PUSHED):
@@ -229,7 +229,7 @@ def test_gradient_of_the_energy_is_the_force(kind, device):
     if kind == "map":
         values = np.random.default_rng(7).normal(size=(4, 4, 4, 3))
         record = FieldMap((-0.05, -0.05, -0.05), (0.1 / 3.0,) * 3, 5.0 * values).record()
-        source = source_of(record, world=0, body=50, pushed=True)
+        source = source_of(record, world=0, body=50, movable=True)
     system, places = make_loaded_system(device, source)
 
     def energy(places, coil=(0.0, 0.0, 0.0)):
@@ -296,7 +296,7 @@ def test_reaction_is_opposite_and_equal(force, device):
 def test_a_source_magnetizes_its_own_body_and_does_not_push_it(device):
     """A coil exerts no force on the core in its own body."""
     for body in (0, 1):
-        coil = LOOP._replace(world=0, body=body, pushed=True)
+        coil = LOOP._replace(world=0, body=body, movable=True)
         system = moment_system(
             radii=[R], bodies=[0], sources=[coil], single_torque=True, dtype="float64", rtol=1e-9, device=device
         )
@@ -314,7 +314,7 @@ def test_a_source_magnetizes_its_own_body_and_does_not_push_it(device):
 
 def test_each_world_has_its_sources(device):
     """The first source is fixed and acts on all worlds; the second is pushed and acts on the second world."""
-    everywhere, second = LOOP, LOOP._replace(world=1, body=9, pushed=True)
+    everywhere, second = LOOP, LOOP._replace(world=1, body=9, movable=True)
     system = moment_system(
         radii=[R, R, R], worlds=[0, 1, 1], saturation=1e9, sources=[everywhere, second], dtype="float64", rtol=1e-10,
         device=device,

@@ -172,8 +172,8 @@ def test_threads_never_show(monkeypatch, device):
         for step in range(4):
             if step == 3 and threads == 3:  # a resumed run
                 before, system = system, scene.system()
-                for name, array in system.carried().items():
-                    array.assign(before.carried()[name])
+                for name, array in system.persistent_arrays().items():
+                    array.assign(before.persistent_arrays()[name])
             scene.solve(system, [(turn, x * (1.0 + 0.01 * step)) for turn, x in zip(turns, at, strict=True)])
             results.append([a.numpy().tobytes() for a in (system.moments, system.error, system.evaluations)])
     assert results[:4] == results[4:]

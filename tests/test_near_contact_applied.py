@@ -22,7 +22,9 @@ TURN = np.array([0.2, -0.4, 0.1, 0.5]) / np.linalg.norm([0.2, -0.4, 0.1, 0.5])
 
 
 def source_of(record):
-    return AppliedSource(SourceKind[record.kind.upper()], record.parameters, record.table, world=0, body=7, pushed=True)
+    return AppliedSource(
+        SourceKind[record.kind.upper()], record.parameters, record.table, world=0, body=7, movable=True
+    )
 
 
 def dipole_map(cells=24, side=0.05):

@@ -117,7 +117,7 @@ def test_the_device_follows_the_rules(machine):
             motion = (float(travel), float(next_travel), float(long_travel))
             outcome, record = rules.judge(*motion, float(overlap), lost, fill)
             rules.known = outcome == "done"
-            machine.judge()
+            machine.end_attempt()
             assert machine.attempting.numpy()[0] == (outcome == "again")
             assert arrays.flags.numpy()[stepping.FLAG_REJECTED] == (outcome != "done")
             if record:
@@ -182,7 +182,7 @@ def test_a_state_of_any_arrays_is_saved_and_restored(machine, device, flags):
     machine.restore()  # nothing was rejected yet
     assert all(not one.numpy().any() for one in own)
     report(machine.arrays, 2.0 * TRAVEL, 0.0, 0.0, 0.0, False, 0)
-    machine.judge()
+    machine.end_attempt()
     machine.restore()
     for one, expected in zip(own, before, strict=True):
         np.testing.assert_array_equal(one.numpy(), expected)
@@ -237,7 +237,7 @@ def test_what_tells_is_how_bodies_glide_along_each_other_where_they_touch(case, 
     sizes = body_sizes(model)
     solver = RigidSolver(model, sizes)
     watched = machine.make_monitor(sizes.thickness, sizes.reach)
-    watched.fills = wp.array(solver.fills(), dtype=wp.uint64, device=device)
+    watched.fill_counts = wp.array(solver.fills(), dtype=wp.uint64, device=device)
     watched.counts = wp.zeros(monitor.COUNT_CAPACITIES + len(solver.buffers), dtype=wp.int32, device=device)
     machine.set_status(stepping.STATUS_LEVEL, level)
     state = model.state()

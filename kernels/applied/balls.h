@@ -34,16 +34,16 @@ template <class Arrays> CUDA_CALLABLE inline Ball ball_at(const Arrays& arrays, 
 
 // Weight of a source's field at a ball, and its gradient by the ball's position. The weight fades from 1 to 0 with the
 // ball's distance from the box around the source. ``offset`` is the vector from the box to the ball.
-struct Fade {
+struct SourceFade {
     Real weight;
     Real3 slope, offset;
 };
-CUDA_CALLABLE inline Fade fade_of(const Ball& ball, const Pose& pose, Real3 center, Real3 half) {
+CUDA_CALLABLE inline SourceFade fade_of(const Ball& ball, const Frame& frame, Real3 center, Real3 half) {
     auto excess = [](Real at, Real half) { return at > half ? at - half : at < -half ? at + half : Real(0); };
-    const Real3 r = ball.center - pose.origin;
-    const Real3 at = pose.to_body(r) - center;
+    const Real3 r = ball.center - frame.origin;
+    const Real3 at = frame.to_body(r) - center;
     const Real3 d = {excess(at.x, half.x), excess(at.y, half.y), excess(at.z, half.z)};
-    const Real3 offset = d.x * pose.x + d.y * pose.y + d.z * pose.z;
+    const Real3 offset = d.x * frame.x + d.y * frame.y + d.z * frame.z;
     const Real distance = wp::sqrt(dot(d, d)) / ball.radius, width = MAGNET_REACH_HIGH - MAGNET_REACH_LOW;
     const Real ramp = (MAGNET_REACH_HIGH - distance) / width, t = ramp < 1 ? ramp : Real(1);
     if (!(t > 0)) return {0, {0, 0, 0}, offset};
@@ -51,7 +51,7 @@ CUDA_CALLABLE inline Fade fade_of(const Ball& ball, const Pose& pose, Real3 cent
     return {t * t * (3 - 2 * t), slope * offset, offset};
 }
 // Adds w H, and its derivatives w ∂H + ∂w H.
-CUDA_CALLABLE inline void add_faded(TargetField& to, const Fade& fade, const TargetField& s) {
+CUDA_CALLABLE inline void add_faded(TargetField& to, const SourceFade& fade, const TargetField& s) {
     auto product = [&](Real slope, Vector v) {
         return (Number(Real(0)) + fade.weight) * v + (Number(Real(0)) + slope) * s.h;
     };
@@ -64,8 +64,8 @@ CUDA_CALLABLE inline void add_faded(TargetField& to, const Fade& fade, const Tar
 template <class Arrays> CUDA_CALLABLE inline void add_coil(const Arrays& arrays, int s, Ball& ball) {
     if (arrays.coils.label.data[s] == ball.label) return;
     const Real* const extent = arrays.coils.extent.data + 6 * (size_t)s;
-    const Pose pose = pose_from((const Real*)arrays.coils.frame.data + 7 * (size_t)s);
-    const Fade fade = fade_of(ball, pose, real3(extent), real3(extent + 3));
+    const Frame frame = frame_of((const Real*)arrays.coils.frame.data + 7 * (size_t)s);
+    const SourceFade fade = fade_of(ball, frame, real3(extent), real3(extent + 3));
     if (fade.weight == 0) return;
     ball.in_field = true;
     for (int v = 0; v < VECTORS_PER_THREAD && Ball::first(v) < CHUNK; ++v) {
@@ -81,9 +81,10 @@ template <class Arrays> CUDA_CALLABLE inline void add_coil(const Arrays& arrays,
 }
 // Adds the field of a permanent body: the closed form within the body's reach, else the field of its lattice. Far away
 // the closed form would lose digits by cancellation.
-template <class Arrays> CUDA_CALLABLE inline void add_body(const Arrays& arrays, const Body& body, Ball& ball) {
+template <class Arrays>
+CUDA_CALLABLE inline void add_body(const Arrays& arrays, const PermanentBody& body, Ball& ball) {
     if (body.responds) return; // its moments are neighbors of the ball already
-    const Fade fade = fade_of(ball, body.pose, body.box_center, body.box_half);
+    const SourceFade fade = fade_of(ball, body.frame, body.box_center, body.box_half);
     if (fade.weight == 0 || body.label == ball.label) return;
     ball.in_field = true;
     const bool near = dot(fade.offset, fade.offset) < body.reach * body.reach;
@@ -91,7 +92,7 @@ template <class Arrays> CUDA_CALLABLE inline void add_body(const Arrays& arrays,
     for (int v = 0; v < VECTORS_PER_THREAD && Ball::first(v) < CHUNK; ++v) {
         const Vector x = ball.points(arrays, v);
         const CurlFreeField field =
-            near ? body.pose.to_world(field_of(body.solid, body.m, body.pose.point_to_body(x), least2, 0, 1))
+            near ? body.frame.to_world(field_of(body.solid, body.m, body.frame.point_to_body(x), least2, 0, 1))
                  : (INVERSE_4PI * lattice_field(arrays, body, x, zero, x.x != x.x, 0, 1));
         add_faded(ball.fields[v], fade, target_field(field));
     }

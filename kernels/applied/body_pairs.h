@@ -11,18 +11,18 @@ constexpr int EDGE_POINT = 19, FACE_POINT = 7;
 // Force/μ0, torque/μ0 and energy/μ0 of body s on body q, less those between the two lattices. The surface charges of q
 // are integrated in the field of s. The torque is about the first moment of q; all results are in the world's frame.
 template <class Arrays>
-CUDA_CALLABLE inline void body_wrench(const Arrays& arrays, const Body& q, const Body& s, Real3& force, Real3& torque,
-                                      Real& energy) {
+CUDA_CALLABLE inline void body_wrench(const Arrays& arrays, const PermanentBody& q, const PermanentBody& s,
+                                      Real3& force, Real3& torque, Real& energy) {
     const Real3 center = reference_point(arrays, q);
     const int* const tables = arrays.solids.shape.data + SHAPE_ROW * (size_t)q.shape;
     const Vector m = broadcast(s.m), m_target = broadcast(q.m);
     Wrench wrench = zero_wrench();
     auto potentials = [&](Vector x, Number& phi, Vector& a) { // scalar and vector potential of s, in the frame of q
-        const Vector g = potentials_of(s.solid, s.pose.point_to_body(q.pose.to_world(x) + broadcast(q.pose.origin)));
+        const Vector g = potentials_of(s.solid, s.frame.point_to_body(q.frame.to_world(x) + broadcast(q.frame.origin)));
         phi = dot(m, g);
-        a = q.pose.to_body(s.pose.to_world(cross(m, g)));
+        a = q.frame.to_body(s.frame.to_world(cross(m, g)));
     };
-    const Vector center_in_body = q.pose.point_to_body(broadcast(center));
+    const Vector center_in_body = q.frame.point_to_body(broadcast(center));
     auto vector_of = [](const Real* rows, int k) {
         return Vector{numbers(rows + k * CHUNK), numbers(rows + (k + 1) * CHUNK), numbers(rows + (k + 2) * CHUNK)};
     };
@@ -52,7 +52,7 @@ CUDA_CALLABLE inline void body_wrench(const Arrays& arrays, const Body& q, const
         wrench.torque += charge * (a - dot(a, n) * n);
         wrench.energy += charge * phi;
     }
-    wrench.force = q.pose.to_world(wrench.force), wrench.torque = q.pose.to_world(wrench.torque);
+    wrench.force = q.frame.to_world(wrench.force), wrench.torque = q.frame.to_world(wrench.torque);
     const Number minus = Number(Real(-INVERSE_4PI));
     for (int i = q.first + WIDTH * share(); i < q.first + q.count; i += WIDTH * SHARES) {
         const size_t pitch = arrays.packed.strides[0] / sizeof(Real);

@@ -23,7 +23,7 @@ from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
-from warpmag.kernels.shared.team import team, threads_for
+from warpmag.kernels.shared.team import launch_passes, threads_for
 
 AT_TARGETS, AT_POINTS, AT_BALLS, REACT, ADD_UP = range(5)
 """Passes; as in ``passes.h``."""
@@ -51,7 +51,6 @@ class AppliedField:
     """Field of sources at targets, in arrays that all launches share.
 
     Args:
-        sources: The sources.
         targets: The targets, packed (``packing.PackedMoments``); read at each launch, as is ``base``.
         worlds: World of each target, shape [t].
         base: Field that is added to [A/m], Warp array, shape [t].
@@ -111,12 +110,10 @@ class AppliedField:
         if items and key not in self._commands:
             sources, pass_and_group = self.sources, (first, group) if cuda else (-1, 1)
             has_coils, has_solids = bool(sources.applied), bool(sources.solids)
-            self._commands[key] = wp.launch(
-                _kernel(sources.dtype, *pass_and_group, has_coils, has_solids, bool(self.rates), self.balls),
-                dim=group * items if cuda else 1,
-                inputs=[first, last + 1, threads_for(items, share), None if cuda else team(), self.arrays],
-                device=self.device,
-                record_cmd=True,
+            kernel = _kernel(sources.dtype, *pass_and_group, has_coils, has_solids, bool(self.rates), self.balls)
+            sizes = dict(threads=threads_for(items, share), gpu_threads=group * items)
+            self._commands[key] = launch_passes(
+                kernel, first, last + 1, self.arrays, device=self.device, record_cmd=True, **sizes
             )
         if items:
             self._commands[key].launch()
@@ -141,12 +138,10 @@ def _probe_kernel(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def add_to_probe(
-        # inputs:
         inside: wp.array[vec3],
         along_x: wp.array[vec3],
         along_y: wp.array[vec3],
         along_z: wp.array[vec3],
-        # in and out:
         b: wp.array[vec3],
         gradients: wp.array[mat33],
     ):
@@ -164,7 +159,6 @@ def _force_kernel(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def add_forces(
-        # inputs:
         movable: wp.array[int],
         source: wp.array[int],
         effective: wp.array2d[dtype],
@@ -172,7 +166,6 @@ def _force_kernel(dtype):
         along_y: wp.array[vec3],
         along_z: wp.array[vec3],
         wrench: wp.array2d[dtype],
-        # in and out:
         forces: wp.array[vec3],
         torques: wp.array[vec3],
     ):
@@ -194,7 +187,6 @@ class AppliedForces(AppliedField):
     """Forces and torques of sources on moments, and the reactions on sources.
 
     Args:
-        sources: The sources.
         worlds: World of each moment, shape [n].
         base: Field at moments that is added to [A/m], Warp array, shape [n].
         movable: True for moments whose force is computed, shape [n].
@@ -239,26 +231,25 @@ class AppliedForces(AppliedField):
     def _lay_out_rows(self, worlds, ball_worlds):
         """List the rows of each reaction that is computed: ranges of targets and of balls."""
         sources, rows, begin = self.sources, [], [0]
-        pushed = [source.pushed for source in sources.applied] + [solid.movable for solid in sources.solids]
+        movable = [source.movable for source in sources.applied] + [solid.movable for solid in sources.solids]
         for s, source in enumerate((*sources.applied, *sources.solids)):
             for least, item_worlds, is_ball in ((_TARGETS_PER_ROW, worlds, 0), (_BALLS_PER_ROW, ball_worlds, 1)):
                 first, end = np.searchsorted(item_worlds, [source.world, source.world + 1])
                 step = max(least, -(-(end - first) // _MOST_ROWS))
-                rows += [(s, k, min(k + step, end), is_ball) for k in range(first, end, step) if pushed[s]]
+                rows += [(s, k, min(k + step, end), is_ball) for k in range(first, end, step) if movable[s]]
             begin.append(len(rows))
         arrays, dtype, device = self.arrays, sources.dtype, self.device
         arrays.row = self._integers(np.array(rows, int).reshape(-1, 4), wp.vec4i)
         arrays.row_begin = self._integers(begin)
         arrays.partial = wp.zeros((len(rows), 6), dtype=dtype, device=device)
-        self.wrenches = arrays.wrench = wp.zeros((len(pushed), 7), dtype=dtype, device=device)
+        self.wrenches = arrays.wrench = wp.zeros((len(movable), 7), dtype=dtype, device=device)
         world_has_several_solids = len(sources.solids) > len(np.unique(sources.solid_worlds))
         self._reacts, self._adds = bool(rows), bool(rows) or world_has_several_solids
 
-    def follow(self, motion):
-        """Evaluate the rates of change of fields from now on. The caller writes ``motion`` and ``source_motion``.
+    def enable_rates(self, motion):
+        """Evaluate the rates of change of fields from now on.
 
-        Args:
-            motion: Motion of the moments (``eddy.eddy.MOTION_ROWS``), shape [8, n].
+        The caller writes ``motion`` of the moments (``eddy.eddy.MOTION_ROWS``), shape [8, n], and ``source_motion``.
         """
         arrays, sources = self.arrays, self.sources
         self.rates = arrays.targets.rate = wp.zeros_like(self.field)

@@ -23,11 +23,11 @@ struct Targets {
     Number radius, label;
     Index corrected;
 };
-template <class Arrays> CUDA_CALLABLE inline Targets targets_at(const Arrays& arrays, int i, int held) {
+template <class Arrays> CUDA_CALLABLE inline Targets targets_at(const Arrays& arrays, int i, int lane_count) {
     const Number zero = Number(Real(0));
     const Vector none = {zero, zero, zero};
     Targets at = {none, zero, zero, {}};
-    if (held <= 0) return at;
+    if (lane_count <= 0) return at;
     const Real* const rows = arrays.targets.packed.data + i;
     const size_t pitch = arrays.targets.packed.strides[0] / sizeof(Real);
     auto row = [=](int n) -> Number { return numbers(rows + n * pitch); };
@@ -35,7 +35,7 @@ template <class Arrays> CUDA_CALLABLE inline Targets targets_at(const Arrays& ar
 #if defined(__CUDA_ARCH__)
     at.corrected = arrays.targets.corrected.data[i];
 #else
-    for (int l = 0; l < held && l < WIDTH; ++l) at.corrected[l] = arrays.targets.corrected.data[i + l];
+    for (int l = 0; l < lane_count && l < WIDTH; ++l) at.corrected[l] = arrays.targets.corrected.data[i + l];
 #endif
     return at;
 }
@@ -44,9 +44,9 @@ template <class Arrays> CUDA_CALLABLE inline Targets targets_at(const Arrays& ar
 // gradient of the coils and maps on other bodies.
 template <class Arrays>
 CUDA_CALLABLE inline Vector add_coil_fields(const Arrays& arrays, const int* list, int begin, int step, int count,
-                                            const Targets& at, int held, TargetField& acting) {
+                                            const Targets& at, int lane_count, TargetField& acting) {
     Vector h = acting.h;
-    for (int l = 0; l < WIDTH && l < held; ++l) {
+    for (int l = 0; l < WIDTH && l < lane_count; ++l) {
         Point sum = {0, 0, 0};
         PointField others = {};
         for (int k = begin; k < count; k += step) {
@@ -62,29 +62,29 @@ CUDA_CALLABLE inline Vector add_coil_fields(const Arrays& arrays, const int* lis
 }
 
 // Mask of targets whose field a body's closed form corrects.
-template <class Arrays> CUDA_CALLABLE inline Mask within_reach(const Body& body, const Targets& at) {
-    return mask_of(at.corrected != 0) & (box_distance2(body, body.pose.point_to_body(at.x)) < body.reach * body.reach);
+template <class Arrays> CUDA_CALLABLE inline Mask within_reach(const PermanentBody& body, const Targets& at) {
+    return mask_of(at.corrected != 0) & (box_distance2(body, body.frame.point_to_body(at.x)) < body.reach * body.reach);
 }
 
 // Writes the fields at a vector of targets. POINTS is true for points of a probe, false for moments.
 template <bool POINTS, class Arrays> CUDA_CALLABLE inline void field_at_targets(const Arrays& arrays, int row) {
     // first target, number of targets, and range of permanent bodies in their world
     const auto& chunk = arrays.targets.chunk.data[row / CHUNK];
-    const int offset = row % CHUNK, held = chunk[1] - offset, i = chunk[0] + offset;
-    if (held <= 0) return;
-    const Targets at = targets_at(arrays, i, held);
+    const int offset = row % CHUNK, lane_count = chunk[1] - offset, i = chunk[0] + offset;
+    if (lane_count <= 0) return;
+    const Targets at = targets_at(arrays, i, lane_count);
     TargetField acting = zero_target_field();
     Vector h = acting.h, inside = h, rate = h;
     if constexpr (COILS) {
         const auto& list = arrays.targets.lists.data[row / CHUNK];
         const int* const first = arrays.coils.list.data + list[0];
-        h = add_coil_fields(arrays, first, share(), SHARES, list[1] - list[0], at, held, acting);
+        h = add_coil_fields(arrays, first, share(), SHARES, list[1] - list[0], at, lane_count, acting);
         if constexpr (RATES)
-            rate = rate_of_coils(arrays, first, share(), SHARES, list[1] - list[0], i, held, at.x, at.label);
+            rate = rate_of_coils(arrays, first, share(), SHARES, list[1] - list[0], i, lane_count, at.x, at.label);
     }
     if constexpr (SOLIDS)
         for (int b = chunk[2]; b < chunk[3]; ++b) {
-            const Body body = body_at(arrays, b);
+            const PermanentBody body = body_at(arrays, b);
             const Mask near = within_reach<Arrays>(body, at);
             if (!any(near)) continue;
             const TargetField field =
@@ -92,7 +92,8 @@ template <bool POINTS, class Arrays> CUDA_CALLABLE inline void field_at_targets(
             add_where(near, h, field.h);
             add_where(near & (at.label != body.label), acting, field);
             if constexpr (RATES)
-                add_where(near & (at.label != body.label), rate, rate_of_body(arrays, body, field, i, held, at.x));
+                add_where(near & (at.label != body.label), rate,
+                          rate_of_body(arrays, body, field, i, lane_count, at.x));
             if constexpr (POINTS)
                 add_where(near, inside, magnetization_correction(arrays, body, at.x, share(), SHARES));
         }
@@ -102,19 +103,20 @@ template <bool POINTS, class Arrays> CUDA_CALLABLE inline void field_at_targets(
     if constexpr (RATES) rate = group_sums(rate);
     if (share() != 0) return;
     const size_t column = 3 * (size_t)i;
-    const Vector base = vectors((Real*)arrays.targets.base.data + column, held);
-    put_vectors((Real*)arrays.targets.field.data + column, held, base + h);
-    put_vectors((Real*)arrays.targets.acting.data + column, held, base + acting.h);
-    put_vectors((Real*)arrays.targets.along_x.data + column, held, acting.x);
-    put_vectors((Real*)arrays.targets.along_y.data + column, held, acting.y);
-    put_vectors((Real*)arrays.targets.along_z.data + column, held, acting.z);
-    if constexpr (POINTS) put_vectors((Real*)arrays.targets.inside.data + column, held, inside);
-    if constexpr (RATES) put_vectors((Real*)arrays.targets.rate.data + column, held, rate);
+    const Vector base = vectors((Real*)arrays.targets.base.data + column, lane_count);
+    put_vectors((Real*)arrays.targets.field.data + column, lane_count, base + h);
+    put_vectors((Real*)arrays.targets.acting.data + column, lane_count, base + acting.h);
+    put_vectors((Real*)arrays.targets.along_x.data + column, lane_count, acting.x);
+    put_vectors((Real*)arrays.targets.along_y.data + column, lane_count, acting.y);
+    put_vectors((Real*)arrays.targets.along_z.data + column, lane_count, acting.z);
+    if constexpr (POINTS) put_vectors((Real*)arrays.targets.inside.data + column, lane_count, inside);
+    if constexpr (RATES) put_vectors((Real*)arrays.targets.rate.data + column, lane_count, rate);
 }
 
 // Wrench of source s on the targets of a row. The reaction on the source is the opposite.
 template <class Arrays>
-CUDA_CALLABLE inline Wrench wrench_on_targets(const Arrays& arrays, int s, const Body& body, int first, int last) {
+CUDA_CALLABLE inline Wrench wrench_on_targets(const Arrays& arrays, int s, const PermanentBody& body, int first,
+                                              int last) {
     Wrench wrench = zero_wrench();
     const bool solid = SOLIDS && s >= arrays.coils.kind.shape[0];
     const Real3 center =
@@ -141,7 +143,7 @@ CUDA_CALLABLE inline Wrench wrench_on_targets(const Arrays& arrays, int s, const
 template <class Arrays> CUDA_CALLABLE inline void react(const Arrays& arrays, int row) {
     const auto& range = arrays.row.data[row]; // source, range of targets or balls, 1 for balls
     const int s = range[0], coils = arrays.coils.kind.shape[0];
-    const Body body = SOLIDS && s >= coils ? body_at(arrays, s - coils) : Body{};
+    const PermanentBody body = SOLIDS && s >= coils ? body_at(arrays, s - coils) : PermanentBody{};
     Real3 force = {0, 0, 0}, torque = force;
     if (!range[3]) {
         const Wrench wrench = wrench_on_targets(arrays, s, body, range[1], range[2]);
@@ -170,18 +172,18 @@ template <class Arrays> CUDA_CALLABLE inline void react(const Arrays& arrays, in
 // smaller body, so that action and reaction are equal to the last bit.
 template <class Arrays>
 CUDA_CALLABLE inline void add_body_pairs(const Arrays& arrays, int b, Real (&total)[WRENCH_ROW]) {
-    const Body body = body_at(arrays, b);
+    const PermanentBody body = body_at(arrays, b);
     const auto& world = arrays.solids.world.data[b]; // the bodies of its world
     for (int c = world[0]; c < world[1]; ++c) {
         if (c == b) continue;
-        const Body other = body_at(arrays, c);
+        const PermanentBody other = body_at(arrays, c);
         if (other.label == body.label) continue;
         const bool is_smaller = body.radius < other.radius || (body.radius == other.radius && b < c);
-        const Body &q = is_smaller ? body : other, &s = is_smaller ? other : body;
-        const Real3 &p = q.pose.origin, &x = q.pose.x, &y = q.pose.y, &z = q.pose.z, &d = q.box_center;
+        const PermanentBody &q = is_smaller ? body : other, &s = is_smaller ? other : body;
+        const Real3 &p = q.frame.origin, &x = q.frame.x, &y = q.frame.y, &z = q.frame.z, &d = q.box_center;
         const Vector center = broadcast(p + d.x * x + (d.y * y + d.z * z));
         const Real reach = q.radius + (q.reach > s.reach ? q.reach : s.reach);
-        if (!any(box_distance2(s, s.pose.point_to_body(center)) < Number(Real(0)) + reach * reach)) continue;
+        if (!any(box_distance2(s, s.frame.point_to_body(center)) < Number(Real(0)) + reach * reach)) continue;
         Real3 force, torque;
         Real energy;
         body_wrench(arrays, q, s, force, torque, energy);

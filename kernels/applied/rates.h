@@ -16,10 +16,10 @@ namespace warpmag {
 // Rate of the field of every ``step``-th coil or map of a list, at targets x from column i on.
 template <class Arrays>
 CUDA_CALLABLE inline Vector rate_of_coils(const Arrays& arrays, const int* list, int begin, int step, int count, int i,
-                                          int held, Vector x, Number label) {
+                                          int lane_count, Vector x, Number label) {
     const size_t pitch = arrays.motion.strides[0] / sizeof(Real);
     Vector rate = zero_target_field().h;
-    for (int l = 0; l < WIDTH && l < held; ++l) {
+    for (int l = 0; l < WIDTH && l < lane_count; ++l) {
         const Real* const target = arrays.motion.data + i + l;
         const Point at = {lane_of(x.x, l), lane_of(x.y, l), lane_of(x.z, l)};
         const Point v = {target[0], target[pitch], target[2 * pitch]};
@@ -40,16 +40,16 @@ CUDA_CALLABLE inline Vector rate_of_coils(const Arrays& arrays, const int* list,
 
 // Rate of a permanent body's field, given ``field`` at targets x from column i on.
 template <class Arrays>
-CUDA_CALLABLE inline Vector rate_of_body(const Arrays& arrays, const Body& body, const TargetField& field, int i,
-                                         int held, Vector x) {
+CUDA_CALLABLE inline Vector rate_of_body(const Arrays& arrays, const PermanentBody& body, const TargetField& field,
+                                         int i, int lane_count, Vector x) {
     const size_t pitch = arrays.motion.strides[0] / sizeof(Real);
     const auto motion_vector = [&](int row) -> Real3 {
         const Real* const column = arrays.motion.data + row * pitch + body.first;
         return {column[0], column[pitch], column[2 * pitch]};
     };
     const Real* const rows = arrays.motion.data + i;
-    const Vector v = {numbers_or(rows, held, 0), numbers_or(rows + pitch, held, 0),
-                      numbers_or(rows + 2 * pitch, held, 0)};
+    const Vector v = {numbers_or(rows, lane_count, 0), numbers_or(rows + pitch, lane_count, 0),
+                      numbers_or(rows + 2 * pitch, lane_count, 0)};
     const Vector w = broadcast(motion_vector(3)), r = x - broadcast(reference_point(arrays, body));
     const Vector u = v - broadcast(motion_vector(0)) - cross(w, r);
     return u.x * field.x + u.y * field.y + u.z * field.z + cross(w, field.h);

@@ -1,4 +1,4 @@
-// Permanent bodies: their poses, the fields of their lattices, and the closed form's correction to these fields.
+// Permanent bodies: their frames, the fields of their lattices, and the closed form's correction to these fields.
 //
 // ``Arrays`` is the struct of sources.py. Takes INVERSE_4PI from Python.
 #pragma once
@@ -10,7 +10,7 @@ namespace warpmag {
 constexpr int SHAPE_ROW = 10, SIZE_ROW = 9; // numbers of a shape and of a body; as in solids.py
 
 // Origin and axes of a body in the world.
-struct Pose {
+struct Frame {
     Real3 origin, x, y, z;
 
     CUDA_CALLABLE Vector to_world(Vector v) const {
@@ -29,8 +29,8 @@ struct Pose {
     }
     CUDA_CALLABLE CurlFreeField to_world(const CurlFreeField& n) const { return {to_world(n.h), to_world(n.t)}; }
 };
-// Pose from a transform: position and quaternion (x, y, z, w), normalized here.
-CUDA_CALLABLE inline Pose pose_from(const Real* at) {
+// Frame from a transform: position and quaternion (x, y, z, w), normalized here.
+CUDA_CALLABLE inline Frame frame_of(const Real* at) {
     const Real x = at[3], y = at[4], z = at[5], w = at[6], n = 2 / (x * x + y * y + z * z + w * w);
     return {real3(at),
             {1 - n * (y * y + z * z), n * (x * y + w * z), n * (x * z - w * y)},
@@ -41,9 +41,9 @@ CUDA_CALLABLE inline Pose pose_from(const Real* at) {
 // A permanent body. Its closed form has the magnetization ``m`` in the body's frame, and ``m_world`` in the world. If
 // the body responds to fields, this is the magnetization of a ball by the remanence alone, without the part that fields
 // induce.
-struct Body {
+struct PermanentBody {
     Solid solid;
-    Pose pose;
+    Frame frame;
     Real3 m, box_center, box_half, m_world;
     Real reach, radius, label; // ``radius`` of its bounding sphere
     int first, count, shape, responds;
@@ -55,7 +55,7 @@ template <class Arrays> CUDA_CALLABLE inline Real packed_at(const Arrays& arrays
 template <class Arrays> CUDA_CALLABLE inline Real3 packed_real3(const Arrays& arrays, int row, int i) {
     return {packed_at(arrays, row, i), packed_at(arrays, row + 1, i), packed_at(arrays, row + 2, i)};
 }
-template <class Arrays> CUDA_CALLABLE inline Body body_at(const Arrays& arrays, int b) {
+template <class Arrays> CUDA_CALLABLE inline PermanentBody body_at(const Arrays& arrays, int b) {
     const int* const row =
         arrays.solids.body.data + 4 * (size_t)b; // shape, first moment, number of moments, 1 if it responds
     const int* const tables = arrays.solids.shape.data + SHAPE_ROW * (size_t)row[0];
@@ -67,41 +67,33 @@ template <class Arrays> CUDA_CALLABLE inline Body body_at(const Arrays& arrays, 
                          arrays.solids.begin.data + tables[4],
                          tables[1],
                          tables[3]};
-    const Pose pose = pose_from((const Real*)arrays.solids.frame.data + 7 * (size_t)b);
+    const Frame frame = frame_of((const Real*)arrays.solids.frame.data + 7 * (size_t)b);
     const int first = row[1];
     const Real3 magnetized =
         row[3] ? real3((const Real*)arrays.solids.bias.data + 3 * (size_t)first) : packed_real3(arrays, 4, first);
     const Real3 m = size[0] * magnetized;
-    return {solid,
-            pose,
-            pose.to_body(m),
-            real3(size + 3),
-            real3(size + 6),
-            m,
-            size[1],
-            size[2],
-            packed_at(arrays, 7, first),
-            first,
-            row[2],
-            row[0],
+    return {solid,           frame,           frame.to_body(m),
+            real3(size + 3), real3(size + 6), m,
+            size[1],         size[2],         packed_at(arrays, 7, first),
+            first,           row[2],          row[0],
             row[3]};
 }
 
 // Moment j of a body's lattice that the closed form replaces. If the body responds to fields, only the part by the
 // remanence.
-template <class Arrays> CUDA_CALLABLE inline Real3 moment_at(const Arrays& arrays, const Body& body, int j) {
+template <class Arrays> CUDA_CALLABLE inline Real3 moment_at(const Arrays& arrays, const PermanentBody& body, int j) {
     if (!body.responds) return packed_real3(arrays, 4, j);
     const Real radius = packed_at(arrays, 3, j), volume = Real(4.18879020478639) * radius * radius * radius;
     return volume * body.m_world;
 }
 
 // Position of a body's first moment, the reference point of its torque.
-template <class Arrays> CUDA_CALLABLE inline Real3 reference_point(const Arrays& arrays, const Body& body) {
+template <class Arrays> CUDA_CALLABLE inline Real3 reference_point(const Arrays& arrays, const PermanentBody& body) {
     return packed_real3(arrays, 0, body.first);
 }
 
 // Squared distance of a point from the body's box, in the body's frame.
-CUDA_CALLABLE inline Number box_distance2(const Body& body, Vector at) {
+CUDA_CALLABLE inline Number box_distance2(const PermanentBody& body, Vector at) {
     const Number zero = Number(Real(0));
     auto excess = [=](Number v, Real center, Real half) {
         const Number d = v - center, size = larger(d, -d) - half;
@@ -115,8 +107,8 @@ CUDA_CALLABLE inline Number box_distance2(const Body& body, Vector at) {
 
 // 4π times field and gradient of a body's lattice at balls of the given radius, as in the sums over pairs.
 template <class Arrays>
-CUDA_CALLABLE inline CurlFreeField lattice_field(const Arrays& arrays, const Body& body, Vector x, Number radius,
-                                                 Mask mask, int begin, int step) {
+CUDA_CALLABLE inline CurlFreeField lattice_field(const Arrays& arrays, const PermanentBody& body, Vector x,
+                                                 Number radius, Mask mask, int begin, int step) {
     CurlFreeField out = zero_field();
     for (int j = body.first + begin; j < body.first + body.count; j += step) {
         const Vector r = x - broadcast(packed_real3(arrays, 0, j));
@@ -144,22 +136,22 @@ CUDA_CALLABLE inline CurlFreeField lattice_field(const Arrays& arrays, const Bod
 
 // Closed form of a body's field less the field of its lattice, in the world.
 template <class Arrays>
-CUDA_CALLABLE inline CurlFreeField field_correction(const Arrays& arrays, const Body& body, Vector x, Number radius,
-                                                    Mask mask, int begin, int step) {
+CUDA_CALLABLE inline CurlFreeField field_correction(const Arrays& arrays, const PermanentBody& body, Vector x,
+                                                    Number radius, Mask mask, int begin, int step) {
     const CurlFreeField near =
-        field_of(body.solid, body.m, body.pose.point_to_body(x), Real(0.25) * radius * radius, begin, step);
+        field_of(body.solid, body.m, body.frame.point_to_body(x), Real(0.25) * radius * radius, begin, step);
     const CurlFreeField far = lattice_field(arrays, body, x, radius, mask, begin, step);
-    return body.pose.to_world(near) - INVERSE_4PI * far;
+    return body.frame.to_world(near) - INVERSE_4PI * far;
 }
 
 // Magnetization of the body less that of its lattice's balls, at x.
 template <class Arrays>
-CUDA_CALLABLE inline Vector magnetization_correction(const Arrays& arrays, const Body& body, Vector x, int begin,
-                                                     int step) {
+CUDA_CALLABLE inline Vector magnetization_correction(const Arrays& arrays, const PermanentBody& body, Vector x,
+                                                     int begin, int step) {
     const Number zero = Number(Real(0));
     Vector m = {zero, zero, zero};
     if (begin == 0)
-        add_where(inside_of(body.solid, body.pose.point_to_body(x)), m, body.pose.to_world(broadcast(body.m)));
+        add_where(inside_of(body.solid, body.frame.point_to_body(x)), m, body.frame.to_world(broadcast(body.m)));
     for (int j = body.first + begin; j < body.first + body.count; j += step) {
         const Vector r = x - broadcast(packed_real3(arrays, 0, j));
         const Real radius = packed_at(arrays, 3, j),

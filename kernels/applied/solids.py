@@ -32,38 +32,24 @@ class SolidMagnet:
 
     The body is uniformly magnetized, or responds to fields. If it responds, induction solves for its moments, and the
     closed form has the magnetization of a ball by the remanence alone.
-
-    Attributes:
-        first, count: First moment, and number of moments.
-        volume: Volume of the first moment [m³].
-        world: Its world.
-        reach: Distance up to which the closed form is used [m].
-        shape: The ``warpmag.shapes.polyhedra.Polyhedron`` that bounds it, in the frame of its body.
-        movable: True if the force on it is computed.
-        response: k = 3χ/(3 + χ) if it responds to fields, else 0.
     """
 
+    # First moment, and number of moments.
     first: int
     count: int
-    volume: float
-    world: int
-    reach: float
-    shape: Any
-    movable: bool
-    response: float = 0.0
+    volume: float  # volume of the first moment [m³]
+    world: int  # its world
+    reach: float  # distance up to which the closed form is used [m]
+    shape: Any  # the ``warpmag.shapes.polyhedra.Polyhedron`` that bounds it, in the frame of its body
+    movable: bool  # true if the force on it is computed
+    response: float = 0.0  # k = 3χ/(3 + χ) if it responds to fields, else 0
 
     def size(self) -> list[float]:
         """Return the body's row of ``size``."""
         lower, upper = self.shape.corners.min(axis=0), self.shape.corners.max(axis=0)
         center = 0.5 * (lower + upper)
         radius = np.linalg.norm(self.shape.corners - center, axis=1).max()
-        return [
-            self.response or 1.0 / self.volume,
-            self.reach,
-            radius,
-            *center,
-            *(0.5 * (upper - lower)),
-        ]
+        return [self.response or 1.0 / self.volume, self.reach, radius, *center, *(0.5 * (upper - lower))]
 
 
 def tables_of(solids, *, fine: bool = False) -> dict[str, np.ndarray]:

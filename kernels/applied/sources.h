@@ -18,8 +18,8 @@ __attribute__((noinline)) CUDA_CALLABLE inline PointField field_of(const Applied
     return {};
 }
 
-// Origin and axes of a source in the world.
-struct SourceFrame {
+// Origin and axes of a source in the world, in double precision (``Frame`` has them as ``Real``).
+struct DoubleFrame {
     Point origin, x, y, z;
 
     CUDA_CALLABLE Point to_local(Point v) const { return {dot(x, v), dot(y, v), dot(z, v)}; }
@@ -35,7 +35,7 @@ CUDA_CALLABLE inline Point point_at(const Real* vectors, int i) {
 }
 
 // Frame of a transform: position and quaternion (x, y, z, w), normalized up to the rounding of Real.
-CUDA_CALLABLE inline SourceFrame frame_from(const Real* t) {
+CUDA_CALLABLE inline DoubleFrame double_frame_of(const Real* t) {
     const double x = t[3], y = t[4], z = t[5], w = t[6], n = 2 / (x * x + y * y + z * z + w * w);
     return {{t[0], t[1], t[2]},
             {1 - n * (y * y + z * z), n * (x * y + w * z), n * (x * z - w * y)},
@@ -45,7 +45,7 @@ CUDA_CALLABLE inline SourceFrame frame_from(const Real* t) {
 
 // Field of source s at x, both in the world.
 template <class Arrays> CUDA_CALLABLE inline PointField field_at(const Arrays& arrays, int s, Point x) {
-    const SourceFrame frame = frame_from((const Real*)arrays.coils.frame.data + 7 * (size_t)s);
+    const DoubleFrame frame = double_frame_of((const Real*)arrays.coils.frame.data + 7 * (size_t)s);
     const int begin = arrays.coils.table_begin.data[s], end = arrays.coils.table_end.data[s];
     const AppliedSource source = {arrays.coils.kind.data[s], point_at((const Real*)arrays.coils.strength.data, s),
                                   arrays.coils.parameters.data + (size_t)s * arrays.coils.parameters.shape[1],

@@ -27,23 +27,15 @@ class SourceKind(IntEnum):
 
 
 class AppliedSource(NamedTuple):
-    """A coil or a field map.
+    """A coil or a field map."""
 
-    Attributes:
-        kind: Its kind.
-        parameters: Numbers that its kind defines, at most ``PARAMETERS``.
-        table: Vectors that its kind defines, shape [k, 3]; sources with the same array object share it.
-        world: World of the moments that it acts on; -1 means all worlds.
-        body: Body that it is fixed to, numbered like the bodies of moments; -1 means none.
-        pushed: True if the reaction on it is computed.
-    """
-
-    kind: SourceKind
-    parameters: tuple[float, ...] = ()
+    kind: SourceKind  # its kind
+    parameters: tuple[float, ...] = ()  # numbers that its kind defines, at most ``PARAMETERS``
+    # Vectors that its kind defines, shape [k, 3]; sources with the same array object share it.
     table: np.ndarray = np.zeros((0, 3))
-    world: int = -1
-    body: int = -1
-    pushed: bool = False
+    world: int = -1  # world of the moments that it acts on; -1 means all worlds
+    body: int = -1  # body that it is fixed to, numbered like the bodies of moments; -1 means none
+    movable: bool = False  # true if it can move, so that the reaction on it is computed
 
     def extent(self) -> np.ndarray:
         """Return center and half sides of the box around its wires, or its nodes [m], shape [6]."""
@@ -176,10 +168,7 @@ class FieldSources:
     """Coils, field maps and permanent bodies on a device.
 
     Args:
-        applied: Coils and maps, ``AppliedSource``.
         solids: Permanent bodies, ``SolidMagnet``, ordered by world.
-        packed: All moments, packed (``packing.PackedMoments``).
-        world_count: Number of worlds.
         bias: M_r/χ of moments that respond to fields [A/m], shape [n]; None without them.
 
     Attributes:

@@ -76,14 +76,15 @@ template <class Couplings> CUDA_CALLABLE inline void share_field(const Couplings
 }
 
 // Increase of cells' demagnetizing factors where they overlap cells of other bodies, over the cells' volume [1/m³].
-template <class Couplings> CUDA_CALLABLE inline Number hardness_of(const Couplings& c, int chunk, int i, int held) {
+template <class Couplings>
+CUDA_CALLABLE inline Number hardness_of(const Couplings& c, int chunk, int i, int lane_count) {
     const Real* const packed = (const Real*)c.packed.data;
     const size_t pitch = c.packed.strides[0] / sizeof(Real);
     const Real *const radii = packed + 3 * pitch, *const labels = packed + 7 * pitch;
     auto of_other_body = [=](Index a, Index b) { return mask_of(collect(labels, a) != collect(labels, b)); };
     const auto& world = c.world.data[chunk]; // range of inducible moments
-    const Number volume = shared_volumes(c, i, held, world[0], world[1], of_other_body),
-                 radius = numbers_or(radii + i, held, 1);
+    const Number volume = shared_volumes(c, i, lane_count, world[0], world[1], of_other_body),
+                 radius = numbers_or(radii + i, lane_count, 1);
     const Real hardening = c.hardening.data[c.body.data[chunk]];
     return hardening * Real(1 / 4.18879020478639) * volume / (radius * radius * radius);
 }
@@ -91,11 +92,11 @@ template <class Couplings> CUDA_CALLABLE inline Number hardness_of(const Couplin
 // Makes a pass over the cells from ``row`` on.
 template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Couplings& c, int pass, int row) {
     const auto& chunk = c.chunk.data[row / CHUNK]; // first moment, count, first row of the body, first row of its table
-    const int offset = row % CHUNK, left = chunk[1] - offset, held = left < 0 ? 0 : left > WIDTH ? WIDTH : left;
-    if (held == 0) return;
+    const int offset = row % CHUNK, left = chunk[1] - offset, lane_count = left < 0 ? 0 : left > WIDTH ? WIDTH : left;
+    if (lane_count == 0) return;
     const int i = chunk[0] + offset;
     if (pass == HARDEN) {
-        const Number hardness = hardness_of(c, row / CHUNK, i, held);
+        const Number hardness = hardness_of(c, row / CHUNK, i, lane_count);
         if (share() == 0) put(c.hardness.data + row, hardness);
         return;
     }
@@ -108,7 +109,7 @@ template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Coupli
     Real* const own = c.body_moments.data + row;
     const size_t pitch = c.body_moments.strides[0] / sizeof(Real);
     if (pass == TURN) {
-        const Vector m = to_body(rotation, vectors((const Real*)c.moments.data + 3 * (size_t)i, held));
+        const Vector m = to_body(rotation, vectors((const Real*)c.moments.data + 3 * (size_t)i, lane_count));
         if (share() != 0) return;
         put(own, m.x);
         put(own + pitch, m.y);
@@ -125,7 +126,7 @@ template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Coupli
     const Vector common = common_field(c.common.data + (size_t)body * COMMON, place);
     const Vector h = sums + common - numbers(c.hardness.data + row) * m;
     Real* const field = (Real*)c.h.data + 3 * (size_t)i;
-    put_vectors(field, held, vectors(field, held) + to_world(rotation, h));
+    put_vectors(field, lane_count, vectors(field, lane_count) + to_world(rotation, h));
 }
 
 template <class Word, class Couplings>

@@ -20,7 +20,7 @@ import warp as wp
 from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
-from warpmag.kernels.shared.team import team, threads_for
+from warpmag.kernels.shared.team import launch_passes, threads_for
 
 COMMON = 8
 """Low-order fields that all cells of a body share: three uniform and five linear ones; as in ``couplings.h``."""
@@ -134,11 +134,10 @@ class CellCouplings:
     @staticmethod
     def _record(couplings, first: int, last: int):
         device, rows = couplings.h.device, CHUNK * couplings.chunk.shape[0]
-        group, threads = group_threads(device), threads_for(rows, _CELLS_PER_THREAD)
-        inputs = [first, last + 1, threads, None if device.is_cuda else team(), couplings]
-        dim = group * rows if device.is_cuda else 1
+        group = group_threads(device)
+        sizes = dict(threads=threads_for(rows, _CELLS_PER_THREAD), gpu_threads=group * rows)
         kernel = _kernel(couplings.packed.dtype, group)
-        return wp.launch(kernel, dim=dim, inputs=inputs, device=device, record_cmd=True)
+        return launch_passes(kernel, first, last + 1, couplings, device=device, record_cmd=True, **sizes)
 
     def _lay_out(self, bodies, whole, worlds, dtype, device) -> int:
         """Fill the arrays; return the number of chunks of the bodies that are not whole, which come first."""

@@ -25,11 +25,11 @@ from warpmag.kernels.pairs import neighbors
 from warpmag.kernels.rigid.newton_views import ContactView
 from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
-from warpmag.kernels.shared.team import team, threads_for
+from warpmag.kernels.shared.team import launch_passes, threads_for
 
 _SKIN = 0.3
 """Fraction of its radius that a ball may move before the neighbor lists are rebuilt."""
-_LARGEST = 2.0
+_LARGEST_LISTED_RADIUS = 2.0
 """Radius [median radii] beyond which a ball is compared with all targets, like other shapes: the largest radius in the
 neighbor lists sets the width of the search's cells."""
 _PADDING = 16
@@ -40,9 +40,9 @@ _TARGETS_AT_ONCE = 64
 """Targets in a chunk of a CPU thread."""
 _MOST_COMPARISONS = 2e7
 """Comparisons with other shapes beyond which Newton's sort is faster."""
-_FEW = 25_000
+_CONSTANT_LIMIT_SHAPES = 25_000
 """Shapes beyond which the limit grows as N^(5/3), like the comparisons of Newton's sort."""
-_MANY = 64
+_OTHERS_FOR_A_WARP = 64
 """Fewest other shapes with which a warp of a GPU shares a target, instead of a smaller group of threads."""
 _BLOCK = 128
 _RESULTS, _RESULT_SIZE = 16 * _TARGETS_AT_ONCE, 12
@@ -57,85 +57,61 @@ _lists_type = neighbors.lists_type(wp.float32)
 
 @wp.struct
 class BroadPhaseArrays:
-    """Arrays of the broad phase, for s shapes, of which t targets can collide: b balls, then o others.
-
-    Attributes:
-        lower, upper: Bounding boxes of the shapes, enlarged by the detection distance of contacts [m], shape [s].
-        displacement: Displacement of the shapes in the substep [m], shape [s], or empty.
-        group, world, body: Collision group, world and body of the shapes, shape [s].
-        kind: Index of each shape's type in ``PARTNERS``, or ``len(PARTNERS)`` for other types, shape [s].
-        scale: Radius of balls and capsules, half length of capsules, half extents of boxes [m], shape [s].
-        margin, gap: Distance of each surface from the shape, and detection distance of contacts [m], shape [s].
-        frame, placement: Pose of the shapes in the world and in their bodies, shape [s].
-        body_qd: Velocities of the bodies, see ``BodyView``.
-        dt: Length of the substep [s].
-        body_flags: Newton's flags of the bodies.
-        excluded: Sorted pairs of shapes that do not collide, ``excluded_count`` of them.
-        fixed_pairs: 1 if shapes that forces do not move collide with each other.
-        farthest: Largest displacement of a shape for which contacts are detected in advance, along an axis [m].
-        shape: Shape of each target, shape [t]. Others of all worlds come first, then others by world, the immovable
-            ones first.
-        range: First other in the world of each target, and the one after the last, shape [t].
-        shared: Number of others of all worlds.
-        radius: Radii of the balls, plus the detection distance [m], shape [b].
-        lists: Neighbor lists of the balls. Packed row 4 holds the radius that a list was made with. The search distance
-            is that of the present balls.
-        boxes: Swept boxes of the others, lower then upper [m], shape [6, o padded].
-        bounds: CPU: bounding box of each vector of swept boxes, shape [6, o / 16 padded].
-        results: CPU: numbers of pairs and contacts of each chunk of targets, and the results, shape [chunks,
-            2 + RESULT_SIZE RESULTS].
-        pairs, pair_count: Out, the pairs and their number, which may exceed the capacity.
-        contacts: Out, contacts of balls; Newton appends its own.
-    """
+    """Arrays of the broad phase, for s shapes, of which t targets can collide: b balls, then o others."""
 
     # Model:
+    # Bounding boxes of the shapes, enlarged by the detection distance of contacts [m], shape [s].
     lower: wp.array[wp.vec3]
     upper: wp.array[wp.vec3]
-    displacement: wp.array[wp.vec3]
+    displacement: wp.array[wp.vec3]  # displacement of the shapes in the substep [m], shape [s], or empty
+    # Collision group, world and body of the shapes, shape [s].
     group: wp.array[int]
     world: wp.array[int]
     body: wp.array[int]
-    kind: wp.array[int]
+    kind: wp.array[int]  # index of each shape's type in ``PARTNERS``, or ``len(PARTNERS)`` for other types, shape [s]
+    # Radius of balls and capsules, half length of capsules, half extents of boxes [m], shape [s].
     scale: wp.array[wp.vec3]
+    # Distance of each surface from the shape, and detection distance of contacts [m], shape [s].
     margin: wp.array[float]
     gap: wp.array[float]
+    # Pose of the shapes in the world and in their bodies, shape [s].
     frame: wp.array[wp.transform]
     placement: wp.array[wp.transform]
-    body_qd: wp.array[wp.spatial_vector]
-    dt: float
-    body_flags: wp.array[int]
-    excluded: wp.array[wp.vec2i]
+    body_qd: wp.array[wp.spatial_vector]  # velocities of the bodies, see ``BodyView``
+    dt: float  # length of the substep [s]
+    body_flags: wp.array[int]  # Newton's flags of the bodies
+    excluded: wp.array[wp.vec2i]  # sorted pairs of shapes that do not collide, ``excluded_count`` of them
     excluded_count: int
-    fixed_pairs: int
-    farthest: float
+    fixed_pairs: int  # 1 if shapes that forces do not move collide with each other
+    farthest: float  # largest displacement of a shape for which contacts are detected in advance, along an axis [m]
     # Targets and work:
+    # Shape of each target, shape [t]. Others of all worlds come first, then others by world, the immovable ones first.
     shape: wp.array[int]
-    range: wp.array[wp.vec2i]
-    shared: int
-    radius: wp.array[float]
+    range: wp.array[wp.vec2i]  # first other in the world of each target, and the one after the last, shape [t]
+    shared: int  # number of others of all worlds
+    radius: wp.array[float]  # radii of the balls, plus the detection distance [m], shape [b]
+    # Neighbor lists of the balls. Packed row 4 holds the radius that a list was made with. The search distance is that
+    # of the present balls.
     lists: _lists_type
-    boxes: wp.array2d[float]
-    bounds: wp.array2d[float]
+    boxes: wp.array2d[float]  # swept boxes of the others, lower then upper [m], shape [6, o padded]
+    bounds: wp.array2d[float]  # CPU: bounding box of each vector of swept boxes, shape [6, o / 16 padded]
+    # CPU: numbers of pairs and contacts of each chunk of targets, and the results, shape [chunks, 2 + RESULT_SIZE
+    # RESULTS].
     results: wp.array2d[int]
     # Data out:
+    # Out, the pairs and their number, which may exceed the capacity.
     pairs: wp.array[wp.vec2i]
     pair_count: wp.array[int]
-    contacts: ContactView
+    contacts: ContactView  # out, contacts of balls; Newton appends its own
 
 
 @dataclass(frozen=True)
 class PairSearch:
-    """Buffers of the search on one device.
+    """Buffers of the search on one device."""
 
-    Attributes:
-        arrays: Arrays of the search, :class:`BroadPhaseArrays`.
-        targets: Number of targets.
-        group: Threads of a GPU that share a target.
-    """
-
-    arrays: Any
-    targets: int
-    group: int
+    arrays: Any  # arrays of the search, :class:`BroadPhaseArrays`
+    targets: int  # number of targets
+    group: int  # threads of a GPU that share a target
 
 
 def allocate(shape_world, shape_body, colliding, ball_radius, *, farthest, device) -> PairSearch | None:
@@ -147,12 +123,11 @@ def allocate(shape_world, shape_body, colliding, ball_radius, *, farthest, devic
         colliding: True for shapes that collide at all, shape [s].
         ball_radius: Radius of a ball plus the detection distance of contacts [m], NaN for other shapes, shape [s].
         farthest: Largest displacement of a shape for which contacts are detected in advance [m].
-        device: Warp device.
     """
     worlds = np.where(colliding, shape_world, -1)
     worlds = worlds if (worlds >= 0).any() else np.zeros_like(worlds)
     is_ball = colliding & np.isfinite(ball_radius) & (worlds >= 0)
-    is_ball &= ball_radius <= _LARGEST * np.median(ball_radius[is_ball]) if is_ball.any() else False
+    is_ball &= ball_radius <= _LARGEST_LISTED_RADIUS * np.median(ball_radius[is_ball]) if is_ball.any() else False
     balls, others = np.flatnonzero(is_ball), np.flatnonzero(colliding & ~is_ball)
     others = others[np.lexsort((shape_body[others] >= 0, worlds[others]))]
     shape = np.concatenate([balls, others])
@@ -160,7 +135,7 @@ def allocate(shape_world, shape_body, colliding, ball_radius, *, farthest, devic
     ranges = np.where(worlds[shape] >= 0, limits, 0).T.astype(np.int32)
     shared = int(np.count_nonzero(worlds[others] < 0))
     comparisons = len(shape) * shared + np.sum(ranges[:, 1] - ranges[:, 0])
-    if comparisons > _MOST_COMPARISONS * max(1.0, len(shape) / _FEW) ** (5 / 3):
+    if comparisons > _MOST_COMPARISONS * max(1.0, len(shape) / _CONSTANT_LIMIT_SHAPES) ** (5 / 3):
         return None
 
     def integers(values, dtype=wp.int32):
@@ -181,7 +156,7 @@ def allocate(shape_world, shape_body, colliding, ball_radius, *, farthest, devic
     chunks = -(-len(shape) // _TARGETS_AT_ONCE) if device.is_cpu else 0
     arrays.results = wp.zeros((chunks, 2 + _RESULT_SIZE * _RESULTS), dtype=int, device=device)
     arrays.farthest = farthest
-    return PairSearch(arrays, len(shape), 32 if len(others) >= _MANY else group_threads(device))
+    return PairSearch(arrays, len(shape), 32 if len(others) >= _OTHERS_FOR_A_WARP else group_threads(device))
 
 
 @cache
@@ -206,12 +181,6 @@ def launch_find_shape_pairs(search: PairSearch) -> None:
 
 
 def _launch(call: str, search: PairSearch, group: int) -> None:
-    device = search.arrays.shape.device
-    threads, members = (0, None) if device.is_cuda else (threads_for(search.targets, _TARGETS_PER_THREAD), team())
-    wp.launch(
-        _kernel(call, group),
-        dim=group * search.targets if device.is_cuda else 1,
-        inputs=[0, 1, threads, members, search.arrays],
-        device=device,
-        block_dim=_BLOCK,
-    )
+    arrays, targets = search.arrays, search.targets
+    sizes = dict(threads=threads_for(targets, _TARGETS_PER_THREAD), gpu_threads=group * targets, block_dim=_BLOCK)
+    launch_passes(_kernel(call, group), 0, 1, arrays, device=arrays.shape.device, **sizes)

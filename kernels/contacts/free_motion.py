@@ -27,14 +27,12 @@ def _rotate(q: wp.quat, rotation: wp.vec3) -> wp.quat:
 
 @wp.kernel
 def _accelerate(
-    # inputs:
     bodies: BodyView,
     gravity_in: wp.array[wp.vec3],
     free_dof_in: wp.array[wp.int32],
     joint_f_in: wp.array[float],
     kinematic_flag: int,
     dt: float,
-    # outputs:
     q_out: wp.array[wp.transform],
     qd_out: wp.array[wp.spatial_vector],
 ):
@@ -55,13 +53,7 @@ def _accelerate(
 
 @wp.kernel
 def _move(
-    # inputs:
-    bodies: BodyView,
-    kinematic_flag: int,
-    dt: float,
-    # outputs:
-    q_out: wp.array[wp.transform],
-    qd_out: wp.array[wp.spatial_vector],
+    bodies: BodyView, kinematic_flag: int, dt: float, q_out: wp.array[wp.transform], qd_out: wp.array[wp.spatial_vector]
 ):
     body = wp.tid()
     if (bodies.flags[body] & kinematic_flag) != 0:
@@ -84,10 +76,7 @@ def launch_accelerate(bodies: BodyView, gravity, kinematic_flag: int, dt: float,
     """Write the present poses of bodies, and their velocities after forces and torques have acted for ``dt`` [s].
 
     Args:
-        bodies: The bodies.
         gravity: Acceleration in each world [m/s²], shape [worlds].
-        kinematic_flag: Newton's flag of kinematic bodies.
-        dt: Length of the substep [s].
         q, qd: Out, poses and velocities, shape [bodies].
         free_dof: First degree of freedom of each body's free joint, -1 without one, shape [bodies]; None to ignore
             ``joint_f``.
@@ -118,13 +107,7 @@ def velocity_change(bodies: BodyView, body: int, linear: wp.vec3, angular: wp.ve
 
 
 @wp.kernel
-def _apply_impulses(
-    # inputs:
-    bodies: BodyView,
-    deltas_io: wp.array[wp.spatial_vector],
-    # outputs:
-    qd_out: wp.array[wp.spatial_vector],
-):
+def _apply_impulses(bodies: BodyView, deltas_io: wp.array[wp.spatial_vector], qd_out: wp.array[wp.spatial_vector]):
     body = wp.tid()
     delta = deltas_io[body]
     deltas_io[body] = wp.spatial_vector()
@@ -133,23 +116,16 @@ def _apply_impulses(
 
 
 def launch_apply_impulses(bodies: BodyView, deltas):
-    """Change the velocities of bodies by impulses, and set the impulses to zero.
-
-    Args:
-        bodies: The bodies.
-        deltas: In and out, impulses and angular impulses about the centers of mass [N·s, N·m·s], shape [bodies].
-    """
+    """Change velocities by impulses and angular impulses about centers of mass [N·s, N·m·s], and set these to zero."""
     wp.launch(_apply_impulses, dim=len(deltas), inputs=[bodies, deltas], outputs=[bodies.qd], device=deltas.device)
 
 
 @wp.kernel
 def _apply_corrections(
-    # inputs:
     bodies: BodyView,
     deltas_in: wp.array[wp.spatial_vector],
     inv_weights_in: wp.array[float],
     dt: float,
-    # outputs:
     q_out: wp.array[wp.transform],
     qd_out: wp.array[wp.spatial_vector],
 ):
@@ -160,7 +136,7 @@ def _apply_corrections(
     delta, pose, com = deltas_in[body] * weight, bodies.q[body], bodies.com[body]
     v, omega = velocity_change(bodies, body, wp.spatial_top(delta), wp.spatial_bottom(delta))
     q = wp.transform_get_rotation(pose)
-    rotated = wp.normalize(q + 0.5 * wp.quat(dt * omega, 0.0) * q)
+    rotated = _rotate(q, dt * omega)
     center = wp.transform_point(pose, com) + dt * v
     q_out[body] = wp.transform(center - wp.quat_rotate(rotated, com), rotated)
     qd_out[body] = bodies.qd[body] + wp.spatial_vector(v, omega)
@@ -170,10 +146,8 @@ def launch_apply_corrections(bodies: BodyView, deltas, inv_weights, dt: float, q
     """Write the poses and velocities after position corrections; as in Newton's kernel, without its rest threshold.
 
     Args:
-        bodies: The bodies.
         deltas: Corrections as impulses and angular impulses about the centers of mass [N·s, N·m·s], shape [bodies].
         inv_weights: Divisor of the impulses of each body, shape [bodies], or None.
-        dt: Length of the substep [s].
         q: Out, poses, shape [bodies].
         qd: Out, velocities, shape [bodies].
     """

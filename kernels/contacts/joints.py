@@ -18,7 +18,14 @@ import warp as wp
 
 from warpmag.kernels.contacts.free_motion import velocity_change
 from warpmag.kernels.contacts.solve import RECOVERY_SPEED
-from warpmag.kernels.rigid.newton_views import BodyView, ContactView, contact_bodies, contact_count, contact_depth
+from warpmag.kernels.rigid.newton_views import (
+    BodyView,
+    ContactView,
+    body_pose,
+    contact_bodies,
+    contact_count,
+    contact_depth,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,64 +39,36 @@ _RETURN_RATE = wp.constant(10.0)
 
 @wp.struct
 class JointView:
-    """Joints of a model, and a row for each axis that has a drive.
-
-    Attributes:
-        parent: Body at one end, -1 for the world, shape [joints].
-        child: Body at the other end, shape [joints].
-        parent_frame: Frame of the joint in the parent's frame, shape [joints].
-        child_frame: Frame of the joint in the child's frame, shape [joints].
-        enabled: False for joints without effect, shape [joints].
-        slides: True if the ends may be at different points, shape [joints].
-        pins: True if the ends must coincide, shape [joints].
-        one_axis: True if the joint rotates about or slides along one axis, shape [joints].
-        dof_start: First degree of freedom, and the one after the last, shape [joints + 1].
-        lower, upper: Limits of each degree of freedom [m or rad], shape [dofs].
-        axis: Direction of each degree of freedom in the frame of the joint, shape [dofs].
-        stiffness: Gain of the position [N/m or N·m/rad], shape [dofs].
-        damping: Gain of the velocity [N·s/m or N·m·s/rad], shape [dofs].
-        effort: Largest force or torque of a drive [N or N·m], shape [dofs].
-        row_joint: Joint of each row, shape [rows].
-        row_dof: Degree of freedom of each row, shape [rows].
-        row_target: Index of its target position, shape [rows].
-        row_is_angular: True for a rotation, false for a slide, shape [rows].
-    """
+    """Joints of a model, and a row for each axis that has a drive."""
 
     # Joints:
-    parent: wp.array[wp.int32]
-    child: wp.array[wp.int32]
-    parent_frame: wp.array[wp.transform]
-    child_frame: wp.array[wp.transform]
-    enabled: wp.array[wp.bool]
-    slides: wp.array[wp.bool]
-    pins: wp.array[wp.bool]
-    one_axis: wp.array[wp.bool]
+    parent: wp.array[wp.int32]  # body at one end, -1 for the world, shape [joints]
+    child: wp.array[wp.int32]  # body at the other end, shape [joints]
+    parent_frame: wp.array[wp.transform]  # frame of the joint in the parent's frame, shape [joints]
+    child_frame: wp.array[wp.transform]  # frame of the joint in the child's frame, shape [joints]
+    enabled: wp.array[wp.bool]  # false for joints without effect, shape [joints]
+    slides: wp.array[wp.bool]  # true if the ends may be at different points, shape [joints]
+    pins: wp.array[wp.bool]  # true if the ends must coincide, shape [joints]
+    one_axis: wp.array[wp.bool]  # true if the joint rotates about or slides along one axis, shape [joints]
     # Degrees of freedom:
-    dof_start: wp.array[wp.int32]
+    dof_start: wp.array[wp.int32]  # first degree of freedom, and the one after the last, shape [joints + 1]
+    # Limits of each degree of freedom [m or rad], shape [dofs].
     lower: wp.array[float]
     upper: wp.array[float]
-    axis: wp.array[wp.vec3]
-    stiffness: wp.array[float]
-    damping: wp.array[float]
-    effort: wp.array[float]
+    axis: wp.array[wp.vec3]  # direction of each degree of freedom in the frame of the joint, shape [dofs]
+    stiffness: wp.array[float]  # gain of the position [N/m or N·m/rad], shape [dofs]
+    damping: wp.array[float]  # gain of the velocity [N·s/m or N·m·s/rad], shape [dofs]
+    effort: wp.array[float]  # largest force or torque of a drive [N or N·m], shape [dofs]
     # Driven axes:
-    row_joint: wp.array[wp.int32]
-    row_dof: wp.array[wp.int32]
-    row_target: wp.array[wp.int32]
-    row_is_angular: wp.array[wp.bool]
+    row_joint: wp.array[wp.int32]  # joint of each row, shape [rows]
+    row_dof: wp.array[wp.int32]  # degree of freedom of each row, shape [rows]
+    row_target: wp.array[wp.int32]  # index of its target position, shape [rows]
+    row_is_angular: wp.array[wp.bool]  # true for a rotation, false for a slide, shape [rows]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Geometry of joints
 # ---------------------------------------------------------------------------------------------------------------------
-
-
-@wp.func
-def _pose(body_q: wp.array[wp.transform], body: int) -> wp.transform:
-    """Return the pose of a body, the identity for the world."""
-    if body < 0:
-        return wp.transform_identity()
-    return body_q[body]
 
 
 @wp.func
@@ -104,7 +83,7 @@ def _center(bodies: BodyView, pose: wp.transform, body: int) -> wp.vec3:
 def _lever_arms(joints: JointView, bodies: BodyView, body_q: wp.array[wp.transform], joint: int, rel: wp.vec3):
     """Return the lever arms of a joint about the centers of mass of parent and child [m], for ends ``rel`` apart."""
     parent, child = joints.parent[joint], joints.child[joint]
-    pose0, pose1 = _pose(body_q, parent), body_q[child]
+    pose0, pose1 = body_pose(body_q, parent), body_q[child]
     end0 = wp.transform_point(pose0, wp.transform_point(joints.parent_frame[joint], rel))
     end1 = wp.transform_point(pose1, wp.transform_get_translation(joints.child_frame[joint]))
     return end0 - _center(bodies, pose0, parent), end1 - _center(bodies, pose1, child)
@@ -113,7 +92,7 @@ def _lever_arms(joints: JointView, bodies: BodyView, body_q: wp.array[wp.transfo
 @wp.func
 def _offset(joints: JointView, body_q: wp.array[wp.transform], joint: int) -> wp.vec3:
     """Return the child's end relative to the parent's end, in the frame of the joint [m]."""
-    frame0 = _pose(body_q, joints.parent[joint]) * joints.parent_frame[joint]
+    frame0 = body_pose(body_q, joints.parent[joint]) * joints.parent_frame[joint]
     frame1 = body_q[joints.child[joint]] * joints.child_frame[joint]
     return wp.transform_get_translation(wp.transform_inverse(frame0) * frame1)
 
@@ -121,7 +100,7 @@ def _offset(joints: JointView, body_q: wp.array[wp.transform], joint: int) -> wp
 @wp.func
 def _angle(joints: JointView, bodies: BodyView, joint: int, axis: wp.vec3) -> float:
     """Return the rotation of the child about an axis of the joint [rad], between -π and π."""
-    q0 = wp.transform_get_rotation(_pose(bodies.q, joints.parent[joint]) * joints.parent_frame[joint])
+    q0 = wp.transform_get_rotation(body_pose(bodies.q, joints.parent[joint]) * joints.parent_frame[joint])
     q1 = wp.transform_get_rotation(bodies.q[joints.child[joint]] * joints.child_frame[joint])
     rel = wp.quat_inverse(q0) * q1
     angle = 2.0 * wp.atan2(wp.dot(wp.vec3(rel[0], rel[1], rel[2]), axis), rel[3])
@@ -136,7 +115,7 @@ def _angle(joints: JointView, bodies: BodyView, joint: int, axis: wp.vec3) -> fl
 @wp.func
 def _remaining_offset(joints: JointView, bodies: BodyView, joint: int, dt: float) -> wp.vec3:
     """Return the offset of a joint's ends that may remain at the end of a substep, in the parent's frame [m]."""
-    pose0, pose1 = _pose(bodies.q, joints.parent[joint]), bodies.q[joints.child[joint]]
+    pose0, pose1 = body_pose(bodies.q, joints.parent[joint]), bodies.q[joints.child[joint]]
     end0 = wp.transform_get_translation(pose0 * joints.parent_frame[joint])
     end1 = wp.transform_get_translation(pose1 * joints.child_frame[joint])
     apart = wp.length(end1 - end0)
@@ -147,11 +126,9 @@ def _remaining_offset(joints: JointView, bodies: BodyView, joint: int, dt: float
 
 @wp.kernel
 def _prepare_joints(
-    # inputs:
     joints: JointView,
     bodies: BodyView,
     dt: float,
-    # outputs:
     parent_frame_out: wp.array[wp.transform],
     child_frame_out: wp.array[wp.transform],
     axis_out: wp.array[wp.vec3],
@@ -185,16 +162,14 @@ def _prepare_joints(
 
 
 def launch_prepare_joints(joints: JointView, bodies: BodyView, dt: float, frames, axes, limits):
-    """Write the joint frames, axes and limits that Newton's kernel uses in a substep.
+    """Write the joint frames, axes and limits that Newton's kernel uses in a substep of ``dt`` [s].
 
     Frames of joints with one axis are rotated so that it is their x axis, because Newton applies limits only there.
     Ends that are apart close, and joints outside of their limits return, at ``_CLOSING_SPEED`` and ``_RETURN_RATE`` at
     most.
 
     Args:
-        joints: The joints.
         bodies: The bodies at the start of the substep.
-        dt: Length of the substep [s].
         frames: Out, joint frames in the parents' and in the children's frames, shape [joints].
         axes: In and out, axes of the degrees of freedom in those frames, shape [dofs].
         limits: Out, lower and upper limits that a substep can reach, shape [dofs].
@@ -210,11 +185,9 @@ def launch_prepare_joints(joints: JointView, bodies: BodyView, dt: float, frames
 
 @wp.kernel
 def _correct_lever_arms(
-    # inputs:
     joints: JointView,
     bodies: BodyView,
     q_now_in: wp.array[wp.transform],
-    # outputs:
     impulses_io: wp.array[wp.spatial_vector],
     deltas_io: wp.array[wp.spatial_vector],
 ):
@@ -238,7 +211,6 @@ def launch_correct_lever_arms(joints: JointView, bodies: BodyView, q_now, impuls
     """Correct the angular impulses of an iteration to the lever arms at the start of the substep.
 
     Args:
-        joints: The joints.
         bodies: The bodies at the start.
         q_now: Poses that the iteration used, shape [bodies].
         impulses: In and out, impulses and angular impulses on the children [N·s, N·m·s]; set to zero, shape [joints].
@@ -270,14 +242,12 @@ def _row_speed(bodies: BodyView, body: int, linear: wp.vec3, angular: wp.vec3) -
 
 @wp.kernel
 def _add_drives(
-    # inputs:
     joints: JointView,
     bodies: BodyView,
     target_q_in: wp.array[float],
     target_qd_in: wp.array[float],
     relaxation: float,
     dt: float,
-    # outputs:
     impulses_io: wp.array[float],
     deltas_io: wp.array[wp.spatial_vector],
 ):
@@ -287,7 +257,7 @@ def _add_drives(
     if not joints.enabled[joint] or (stiffness <= 0.0 and damping <= 0.0):
         return
     parent, child = joints.parent[joint], joints.child[joint]
-    frame = _pose(bodies.q, parent) * joints.parent_frame[joint]
+    frame = body_pose(bodies.q, parent) * joints.parent_frame[joint]
     axis = wp.transform_vector(frame, joints.axis[dof])
     linear, angular0, angular1, error = wp.vec3(0.0), axis, axis, float(0.0)
     if joints.row_is_angular[row]:
@@ -320,9 +290,7 @@ def launch_add_drives(joints: JointView, bodies: BodyView, targets, impulses, de
     """Add the impulses of drives in an iteration.
 
     Args:
-        joints: The joints.
         bodies: The bodies, with poses at the start of the substep and present velocities.
-        targets: Target positions and velocities.
         impulses: In and out, accumulated impulses of the drives [N·s or N·m·s], shape [rows].
         deltas: In and out, sums of the iteration's impulses on each body, shape [bodies].
         relaxation: Fraction of each correction that is applied.
@@ -348,13 +316,7 @@ def _kinematic_velocity(bodies: BodyView, kinematic_flag: int, body: int, point:
 
 @wp.kernel
 def _limit_recovery_speed(
-    # inputs:
-    contacts: ContactView,
-    bodies: BodyView,
-    kinematic_flag: int,
-    dt: float,
-    # outputs:
-    margin_out: wp.array[float],
+    contacts: ContactView, bodies: BodyView, kinematic_flag: int, dt: float, margin_out: wp.array[float]
 ):
     i = wp.tid()
     if i >= contact_count(contacts):
@@ -371,9 +333,7 @@ def launch_limit_recovery_speed(contacts: ContactView, bodies: BodyView, kinemat
     """Write margins with which Newton's kernel separates overlapping bodies at ``RECOVERY_SPEED`` at most.
 
     Args:
-        contacts: The contacts.
         bodies: The bodies at the start of the substep, but kinematic ones at its end.
-        kinematic_flag: Newton's flag of kinematic bodies.
         dt: Length of the substep [s].
         margin: Out, margins in place of ``contacts.margin0`` [m], shape [contact_max].
     """
@@ -382,10 +342,7 @@ def launch_limit_recovery_speed(contacts: ContactView, bodies: BodyView, kinemat
 
 
 @wp.kernel
-def _count_down(
-    # outputs:
-    left_out: wp.array[int],
-):
+def _count_down(left_out: wp.array[int]):
     left_out[0] = left_out[0] - 1
 
 

@@ -26,7 +26,7 @@ ENTRIES = 36
 _STABLE_RELAXATION = wp.constant(2.0 * (1.0 + MOMENTUM) / (1.0 + 2.0 * MOMENTUM))
 _TOUCHING_GAP = wp.constant(0.1)
 """Distance up to which open contacts count, relative to the sum of their shapes' contact gaps."""
-_STEPS = wp.constant(16384.0)
+_STEPS_PER_UNIT = wp.constant(16384.0)
 """Inverse resolution of entries of G, which are summed as integers: their sum does not depend on the order."""
 
 
@@ -116,13 +116,11 @@ def _normal_speed(bodies: BodyView, body: int, point: wp.vec3, normal: wp.vec3) 
 
 @wp.kernel
 def _add_contacts(
-    # inputs:
     contacts: ContactView,
     bodies: BodyView,
     splits_in: wp.array[wp.int32],
     relaxation: float,
     dt: float,
-    # outputs:
     entries_out: wp.array2d[wp.int32],
 ):
     i = wp.tid()
@@ -147,7 +145,7 @@ def _add_contacts(
             matrix = _contact_matrix(bodies, body, point, n, friction, rotational_friction, relaxation)
             for j in range(6):
                 for k in range(j, 6):
-                    wp.atomic_add(entries_out, 6 * j + k, body, int(wp.rint(_STEPS * matrix[j, k])))
+                    wp.atomic_add(entries_out, 6 * j + k, body, int(wp.rint(_STEPS_PER_UNIT * matrix[j, k])))
 
 
 @wp.kernel
@@ -156,7 +154,7 @@ def _find_shares(entries_io: wp.array2d[wp.int32], shares_out: wp.array[float]):
     rows, square = wp.spatial_vector(), float(0.0)
     for j in range(6):
         for k in range(j, 6):
-            entry = wp.abs(float(entries_io[6 * j + k, body])) / _STEPS
+            entry = wp.abs(float(entries_io[6 * j + k, body])) / _STEPS_PER_UNIT
             entries_io[6 * j + k, body] = 0
             rows[j] += entry
             square += entry * entry
@@ -175,7 +173,6 @@ def launch_find_shares(
     """Write the number of shares into which each body is divided.
 
     Args:
-        contacts: The contacts.
         bodies: Bodies as contacts were detected, with their velocities without contacts.
         splits: 1 for bodies that may be divided, shape [bodies].
         entries: Work array of zeros, zero again afterwards, shape [``ENTRIES``, bodies].
@@ -192,11 +189,9 @@ def launch_find_shares(
 
 @wp.kernel
 def _split_masses(
-    # inputs:
     shares_in: wp.array[float],
     inv_mass_in: wp.array[float],
     inv_inertia_in: wp.array[wp.mat33],
-    # outputs:
     inv_mass_out: wp.array[float],
     inv_inertia_out: wp.array[wp.mat33],
 ):
@@ -206,11 +201,5 @@ def _split_masses(
 
 
 def launch_split_masses(shares, whole, split):
-    """Write the inverse masses [1/kg] and inertias [1/(kg·m²)] of a share of each body.
-
-    Args:
-        shares: Number of shares of each body, shape [body_count].
-        whole: Inverse masses and inertias of the bodies, each of shape [body_count].
-        split: Out, inverse masses and inertias of the shares, each of shape [body_count].
-    """
+    """Write the inverse masses [1/kg] and inertias [1/(kg·m²)] of a share of each body, from those of whole bodies."""
     wp.launch(_split_masses, dim=len(shares), inputs=[shares, *whole], outputs=[*split], device=shares.device)

@@ -43,7 +43,7 @@ from warpmag.kernels.material.curves import CurveParameters, curve_derivative_ti
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel, native_options
-from warpmag.kernels.shared.team import team, threads_for
+from warpmag.kernels.shared.team import launch_passes, threads_for
 
 _RATES, _FIELDS = range(2)
 """The passes; as in ``rates.h``."""
@@ -126,7 +126,6 @@ def _brake_kernel(dtype):
 
     @wp.kernel(module="unique", enable_backward=False, module_options=native_options("material/curves.h", dtype=dtype))
     def brake(
-        # inputs:
         arrays: eddy_arrays,
         applied: wp.array[vec3],
         applied_rates: wp.array[vec3],
@@ -134,7 +133,6 @@ def _brake_kernel(dtype):
         along_y: wp.array[vec3],
         along_z: wp.array[vec3],
         step: dtype,
-        # in and out:
         effective: wp.array2d[dtype],
     ):
         slot = arrays.slot[wp.tid()]
@@ -270,14 +268,10 @@ class EddyCurrents:
         return np.concatenate([empty, *balls])
 
     def _make_pass(self, number: int, places: int):
-        cuda = self._device.is_cuda
         if places:
-            wp.launch(
-                _passes(self._packed.dtype, _GROUP if cuda else 1),
-                dim=_GROUP * places if cuda else 1,
-                inputs=[number, number + 1, self._threads, None if cuda else team(), self._arrays],
-                device=self._device,
-            )
+            kernel = _passes(self._packed.dtype, _GROUP if self._device.is_cuda else 1)
+            sizes = dict(threads=self._threads, gpu_threads=_GROUP * places)
+            launch_passes(kernel, number, number + 1, self._arrays, device=self._device, **sizes)
 
     def add(self, applied, sources=None, effective=None):
         """Add the eddy moments to the packed moments, for the sums over pairs that compute forces.
@@ -293,12 +287,7 @@ class EddyCurrents:
         wp.launch(_brake_kernel(self._packed.dtype), len(self._arrays.slot), inputs=inputs, device=self._device)
 
     def finish(self, moments, torques):
-        """Add the torques on inducible balls, and restore the packed moments without eddy moments.
-
-        Args:
-            moments: The moments [A·m²], shape [n].
-            torques: In and out, torques [N·m], shape [n].
-        """
+        """Add the torques [N·m] on inducible balls, and restore the packed moments without eddy moments."""
         arrays, dtype, device = self._arrays, self._packed.dtype, self._device
         self._make_pass(_FIELDS, len(arrays.torque_ball))
         wp.launch(_turn_kernel(dtype), len(arrays.torque_slot), inputs=[arrays, torques], device=device)

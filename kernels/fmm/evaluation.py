@@ -27,7 +27,6 @@ class FmmSums:
 
     Args:
         octree: The octree, built by the caller whenever moments have moved.
-        tables: Coefficients of the harmonics.
         quantity: Quantity that is summed; ``MUTUAL_FORCE`` is summed as ``FORCE``.
         first: Packed column of the first target in the octree.
         sources: True for moments that are sources, NumPy, shape [n]; None means all moments.
@@ -62,36 +61,19 @@ class FmmSums:
             partial: Out: sums of the target rows, shape [1, rows, 3 or 6].
         """
         octree, device, dtype = self._octree, self._octree.device, self._sums.dtype
-        wp.launch(
-            _moments_kernel(dtype),
-            octree.count,
-            [octree.packed, octree.packed_index, self._sources],
-            [self._moments],
-            device=device,
-        )
+        inputs = [octree.packed, octree.packed_index, self._sources]
+        wp.launch(_moments_kernel(dtype), octree.count, inputs, [self._moments], device=device)
         if self._quantity != Quantity.FIELD:
-            wp.launch(
-                _sort_kernel(dtype),
-                (3, octree.count),
-                [effective, octree.packed_index],
-                [self._effective],
-                device=device,
-            )
+            inputs = [effective, octree.packed_index]
+            wp.launch(_sort_kernel(dtype), (3, octree.count), inputs, [self._effective], device=device)
         if self._shares is not None:
             self._shares.find()
             self._sums.zero_()
         with self._concurrent():
             self._expansions.compute_multipoles()
             self._expansions.translate()
-        launch_near_sums(
-            self._quantity,
-            self._moments,
-            self._effective,
-            octree.neighbors,
-            octree.moment_begin,
-            self._leaves,
-            self._sums,
-        )
+        leaves = octree.neighbors, octree.moment_begin, self._leaves
+        launch_near_sums(self._quantity, self._moments, self._effective, *leaves, self._sums)
         if self._stream is not None:
             wp.get_stream(device).wait_event(self._events[1])
         self._expansions.add_fields()
@@ -116,12 +98,7 @@ class FmmSums:
 def _moments_kernel(dtype):
     @wp.kernel(module="unique", enable_backward=False)
     def sort_moments(
-        # inputs:
-        packed: wp.array2d[dtype],
-        packed_index: wp.array[int],
-        is_source: wp.array[int],
-        # outputs:
-        sorted_out: wp.array2d[dtype],
+        packed: wp.array2d[dtype], packed_index: wp.array[int], is_source: wp.array[int], sorted_out: wp.array2d[dtype]
     ):
         i = wp.tid()
         j = packed_index[i]
@@ -134,13 +111,7 @@ def _moments_kernel(dtype):
 @cache
 def _sort_kernel(dtype):
     @wp.kernel(module="unique", enable_backward=False)
-    def sort_vectors(
-        # inputs:
-        vectors: wp.array2d[dtype],
-        packed_index: wp.array[int],
-        # outputs:
-        sorted_out: wp.array2d[dtype],
-    ):
+    def sort_vectors(vectors: wp.array2d[dtype], packed_index: wp.array[int], sorted_out: wp.array2d[dtype]):
         c, i = wp.tid()
         sorted_out[c, i] = vectors[c, packed_index[i]]
 
@@ -151,12 +122,7 @@ def _sort_kernel(dtype):
 def _return_kernel(dtype):
     @wp.kernel(module="unique", enable_backward=False)
     def return_sums(
-        # inputs:
-        sums: wp.array2d[dtype],
-        target: wp.array[int],
-        sorted_index: wp.array[int],
-        # outputs:
-        partial_out: wp.array3d[dtype],
+        sums: wp.array2d[dtype], target: wp.array[int], sorted_index: wp.array[int], partial_out: wp.array3d[dtype]
     ):
         row, c = wp.tid()
         partial_out[0, row, c] = sums[sorted_index[target[row]], c]
@@ -171,7 +137,6 @@ def sampled_error(sums, moments, ranges, target_base, base) -> float:
 
     Args:
         sums: Sums of the targets' fields at each other, as ``PairEvaluation`` takes them; None sums over all pairs.
-        moments: Packed moments.
         ranges: Columns of each world: begin and end of targets, and end of sources, integers [worlds, 3].
         target_base: Base field of the targets' sums, including the field of other sources [A/m], shape [n].
         base: Base field of the sums over all sources [A/m], shape [n].

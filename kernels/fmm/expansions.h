@@ -114,13 +114,13 @@ CUDA_CALLABLE inline FieldForce evaluate_expansion(const Arrays& a, const FieldE
     const Real scale = Real(1) / (Real)a.frame.data[4], volume = scale * scale * scale;
     return {(zero + volume) * result.h, (zero + scale) * ((zero + volume) * result.f)};
 }
-CUDA_CALLABLE inline void add_vectors(Real* rows, int row, int held, Vector v) {
-    for (int l = 0; l < held && l < WIDTH; ++l, rows += row)
+CUDA_CALLABLE inline void add_vectors(Real* rows, int row, int lane_count, Vector v) {
+    for (int l = 0; l < lane_count && l < WIDTH; ++l, rows += row)
         rows[0] += lane_of(v.x, l), rows[1] += lane_of(v.y, l), rows[2] += lane_of(v.z, l);
 }
-template <Quantity Q> CUDA_CALLABLE inline void add_sums(Real* sums, int held, const FieldForce& result) {
-    if (has_force(Q)) add_vectors(sums, width(Q), held, result.f);
-    if (has_field(Q)) add_vectors(sums + width(Q) - 3, width(Q), held, result.h);
+template <Quantity Q> CUDA_CALLABLE inline void add_sums(Real* sums, int lane_count, const FieldForce& result) {
+    if (has_force(Q)) add_vectors(sums, width(Q), lane_count, result.f);
+    if (has_field(Q)) add_vectors(sums + width(Q) - 3, width(Q), lane_count, result.h);
 }
 
 // Computes the multipole of a leaf; on a GPU a block does.
@@ -141,8 +141,9 @@ template <class Arrays> CUDA_CALLABLE inline void leaf_multipole(const Arrays& a
                         [&](int j, Real r) { harmonics[j][lane] = r; });
         if (threadIdx.x < 32) {
             const Vector m = sorted.vector(4, i);
-            const bool held = first + lane < end;
-            moments[0][lane] = held ? m.x : 0, moments[1][lane] = held ? m.y : 0, moments[2][lane] = held ? m.z : 0;
+            const bool exists = first + lane < end;
+            moments[0][lane] = exists ? m.x : 0, moments[1][lane] = exists ? m.y : 0,
+            moments[2][lane] = exists ? m.z : 0;
         }
         __syncthreads();
 #pragma unroll

@@ -32,27 +32,18 @@ class _Step(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class ExpansionTables:
-    """Coefficients and matrices of the K = (p + 1)² solid harmonics up to degree p, in float64.
+    """Coefficients and matrices of the K = (p + 1)² solid harmonics up to degree p, in float64."""
 
-    Attributes:
-        degree: Highest degree p.
-        growth, decay: Factors of the recurrence R_n = growth z R_(n−1) − decay r² R_(n−2), degree n and order m, shape
-            [K]. Where n = m, ``growth`` is the factor of (x + iy) R_(m−1).
-        derivatives: Matrices D with ∇R_i = Σ_j D[:, i, j] R_j, shape [3, K, K].
-        multipole_to_parent: M2M matrix of a child in octant 0, shape [K, K].
-        local_to_child: L2L matrix of a child in octant 0, shape [K, K].
-        multipole_to_local: M2L matrix of each displacement in ``translate.displacements``, shape [56, K, K].
-        parity: Signs of the harmonics under reflections x → −x, y → −y and z → −z, shape [3, K].
-    """
-
-    degree: int
+    degree: int  # highest degree p
+    # Factors of the recurrence R_n = growth z R_(n−1) − decay r² R_(n−2), degree n and order m, shape [K]. Where n = m,
+    # ``growth`` is the factor of (x + iy) R_(m−1).
     growth: np.ndarray
     decay: np.ndarray
-    derivatives: np.ndarray
-    multipole_to_parent: np.ndarray
-    local_to_child: np.ndarray
-    multipole_to_local: np.ndarray
-    parity: np.ndarray
+    derivatives: np.ndarray  # matrices D with ∇R_i = Σ_j D[:, i, j] R_j, shape [3, K, K]
+    multipole_to_parent: np.ndarray  # M2M matrix of a child in octant 0, shape [K, K]
+    local_to_child: np.ndarray  # L2L matrix of a child in octant 0, shape [K, K]
+    multipole_to_local: np.ndarray  # M2L matrix of each displacement in ``translate.displacements``, shape [56, K, K]
+    parity: np.ndarray  # signs of the harmonics under reflections x → −x, y → −y and z → −z, shape [3, K]
 
 
 @cache
@@ -96,8 +87,6 @@ class Expansions:
     """Multipoles and local expansions of an octree's boxes, and the fields of the local expansions at its moments.
 
     Args:
-        octree: The octree.
-        tables: Coefficients of the harmonics.
         quantity: Quantity at the moments, ``FIELD``, ``FORCE`` or ``WRENCH``.
         moments: Packed moments in the octree's order, shape [8, n]; written by the caller.
         effective: Effective moments e of the force in the same order, shape [3, n].

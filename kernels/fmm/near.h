@@ -33,34 +33,36 @@ CUDA_CALLABLE inline Sums<Real> from_lane(const Sums<Real>& s, int step) {
     return {from_lane(s.f, step), from_lane(s.h, step), from_lane(s.g, step), __shfl_xor_sync(ALL_LANES, s.a, step)};
 }
 
-// Sums up to LANES × HELD targets of a leaf, from column ``begin`` on. ``own`` is the source number of the first
+// Sums up to LANES × TARGETS targets of a leaf, from column ``begin`` on. ``own`` is the source number of the first
 // target.
-template <Quantity Q, int LANES, int HELD>
+template <Quantity Q, int LANES, int TARGETS>
 CUDA_CALLABLE inline void sum_targets(int lane, const Table& moments, const Table& effective, const NearRanges& ranges,
                                       int own, int begin, int count, Quad* staged, Real* out) {
     constexpr bool FIELD = Q == Quantity::FIELD;
-    constexpr int UNROLLED = HELD < 3 ? 4 : 2;
+    constexpr int UNROLLED = TARGETS < 3 ? 4 : 2;
     const auto target_at = [&](int k) -> Target {
         const int column = begin + min(lane % LANES + LANES * k, count - 1);
         const Moment t = moments.moment(column);
         return {t.x, t.radius, t.label, FIELD ? Vec3<Real>{} : effective.vector(0, column)};
     };
-    LaneTargets<Q, HELD> held;
+    LaneTargets<Q, TARGETS> lane_targets;
     const NearSources sources = {moments, ranges};
-    add_sources<LANES, UNROLLED, true>(held, target_at, sources, 0, ranges.start[9], 0, own, count, lane, staged);
+    add_sources<LANES, UNROLLED, true>(lane_targets, target_at, sources, 0, ranges.start[9], 0, own, count, lane,
+                                       staged);
 #pragma unroll
-    for (int k = 0; k < HELD; ++k) {
+    for (int k = 0; k < TARGETS; ++k) {
         if constexpr (LANES < 32) {
 #pragma unroll
-            for (int step = LANES; step < 32; step *= 2) held.sums[k] += from_lane(held.sums[k], step);
+            for (int step = LANES; step < 32; step *= 2) lane_targets.sums[k] += from_lane(lane_targets.sums[k], step);
         }
         const int i = lane % LANES + LANES * k;
-        if (lane < LANES && i < count) results<Q>(held.sums[k], held.targets[k].e, out + (size_t)i * width(Q));
+        if (lane < LANES && i < count)
+            results<Q>(lane_targets.sums[k], lane_targets.targets[k].e, out + (size_t)i * width(Q));
     }
 }
 
-template <int LANES, int HELD> struct Form {
-    static constexpr int lanes = LANES, held = HELD;
+template <int LANES, int TARGETS> struct Form {
+    static constexpr int lanes = LANES, targets = TARGETS;
 };
 
 // One thread of a block; each warp of the block sums one leaf.
@@ -95,8 +97,8 @@ template <Quantity Q, int WARPS, class Arrays> CUDA_CALLABLE inline void sum_lea
         const int count = min(32 * TARGETS_PER_LANE, end - first), own = first - own_shift;
         Real* const out = arrays.sums.data + (size_t)first * width(Q);
         const auto sum = [&](auto form) {
-            sum_targets<Q, form.lanes, form.held>(lane, moments, effective, ranges, own, first, count, staging[warp],
-                                                  out);
+            sum_targets<Q, form.lanes, form.targets>(lane, moments, effective, ranges, own, first, count, staging[warp],
+                                                     out);
         };
         // The fewest target slots that suffice; several targets per lane amortize the cost of loading a source.
         if constexpr (TARGETS_PER_LANE == 2) {

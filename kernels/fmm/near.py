@@ -11,7 +11,7 @@ import warp as wp
 from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.pairs.work_list import tile_size
 from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
-from warpmag.kernels.shared.team import team, threads_for
+from warpmag.kernels.shared.team import launch_passes, threads_for
 
 _LEAVES_PER_THREAD = 16
 """Leaves per thread of a CPU, at least."""
@@ -68,7 +68,7 @@ def launch_near_sums(quantity: Quantity, moments, effective, neighbors, moment_b
         wp.launch(_cuda_kernel(sums.dtype, quantity), dim=dim, inputs=[a], device=device, block_dim=block)
         return
     threads = threads_for(capacity, _LEAVES_PER_THREAD)
-    wp.launch(_cpu_kernel(sums.dtype, quantity), dim=1, inputs=[0, 1, threads, team(), a], device=device)
+    launch_passes(_cpu_kernel(sums.dtype, quantity), 0, 1, a, device=device, threads=threads)
 
 
 @cache

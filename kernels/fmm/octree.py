@@ -41,7 +41,7 @@ def _arrays_type(dtype):
     @wp.struct
     class OctreeArrays:
         # Moments in:
-        packed: wp.array2d[dtype]
+        packed: wp.array2d[dtype]  # the packed moments, shape [8, n]
         group: wp.array[int]
         # Parameters:
         depth: int
@@ -53,10 +53,12 @@ def _arrays_type(dtype):
         # Cube, and numbers of boxes:
         block_bounds: wp.array2d[dtype]
         arrived: wp.array[int]
+        # Corner of the cube, its edge, the edge of a leaf, and the leaf edge that would give the target occupancy [m],
+        # shape [6].
         frame: wp.array[wp.float64]
         box_starts: wp.array2d[int]
-        counts: wp.array[int]
-        level_begin: wp.array[int]
+        counts: wp.array[int]  # levels below the cube, and number of boxes, shape [2]
+        level_begin: wp.array[int]  # first box of each height, shape [levels + 1]
         # Moments along the Morton curve:
         keys: wp.array[wp.uint64]
         index: wp.array[int]
@@ -70,19 +72,21 @@ def _arrays_type(dtype):
         unsorted_parent: wp.array[int]
         moment_counts: wp.array[int]
         # Boxes out:
-        moment_begin: wp.array[int]
+        moment_begin: wp.array[int]  # first sorted moment of each leaf, shape [c + 1]
+        # Box of the same height at each offset x + 3 y + 9 z from (−1, −1, −1), −1 for none, shape [c, 27].
         neighbors: wp.array2d[int]
-        children: wp.array2d[int]
-        parent: wp.array[int]
-        octant: wp.array[int]
+        children: wp.array2d[int]  # child in each octant x + 2 y + 4 z, −1 for none, shape [c, 8]
+        parent: wp.array[int]  # parent of each box, −1 for none, shape [c]
+        octant: wp.array[int]  # octant of each box in its parent, shape [c]
         order_keys: wp.array[int]
-        order: wp.array[int]
-        octant_begin: wp.array2d[int]
+        order: wp.array[int]  # boxes sorted by height and octant, shape [c]
+        octant_begin: wp.array2d[int]  # range of each height and octant in ``order``, shape [levels, 9]
         # Moments out:
-        packed_index: wp.array[int]
-        leaf: wp.array[int]
-        sorted_index: wp.array[int]
-        sorted: wp.array2d[dtype]
+        packed_index: wp.array[int]  # packed column of each sorted moment, shape [n]
+        leaf: wp.array[int]  # leaf of each sorted moment, shape [n]
+        sorted_index: wp.array[int]  # sorted index of each packed column, shape [n]
+        sorted: wp.array2d[dtype]  # the packed moments in sorted order, shape [8, n]
+        # Position of each sorted moment relative to its leaf's center, in leaf edges, shape [3, n].
         leaf_position: wp.array2d[dtype]
 
     return OctreeArrays
@@ -94,31 +98,13 @@ class Octree:
     Args:
         packed: Packed moments, shape [8, n], at least one.
         groups: World of each moment, shape [n].
-        worlds: Number of worlds.
         occupancy: Target for the mean number of moments in a leaf.
         reach: Largest distance of two moments in contact [m]; leaves are at least as large.
 
     Attributes:
-        count: Number of moments n.
-        capacity: Most boxes c.
-        levels: Most levels.
-        frame: Corner of the cube, its edge, the edge of a leaf, and the leaf edge that would give the target occupancy
-            [m], shape [6].
-        counts: Levels below the cube, and number of boxes, shape [2].
-        level_begin: First box of each height, shape [levels + 1].
-        moment_begin: First sorted moment of each leaf, shape [c + 1].
-        neighbors: Box of the same height at each offset x + 3 y + 9 z from (−1, −1, −1), −1 for none, shape [c, 27].
-        children: Child in each octant x + 2 y + 4 z, −1 for none, shape [c, 8].
-        parent: Parent of each box, −1 for none, shape [c].
-        octant: Octant of each box in its parent, shape [c].
-        order: Boxes sorted by height and octant, shape [c].
-        octant_begin: Range of each height and octant in ``order``, shape [levels, 9].
-        packed_index: Packed column of each sorted moment, shape [n].
-        sorted_index: Sorted index of each packed column, shape [n].
-        leaf: Leaf of each sorted moment, shape [n].
-        packed: The packed moments, shape [8, n].
-        sorted: The packed moments in sorted order, shape [8, n].
-        leaf_position: Position of each sorted moment relative to its leaf's center, in leaf edges, shape [3, n].
+        count, capacity, levels: Number of moments n, most boxes c, and most levels.
+
+    The other attributes are arrays of the struct with the same names, written by :meth:`build`.
     """
 
     def __init__(self, packed, groups, worlds: int = 1, *, occupancy: float, reach: float = 0.0):

@@ -24,7 +24,6 @@ class BoxShares:
     """One process's share of the boxes.
 
     Args:
-        octree: The octree.
         ranks: The processes (``warpmag.moments.ranks.Ranks``).
 
     Attributes:
@@ -61,12 +60,10 @@ class BoxShares:
 
 @wp.kernel(module="unique", enable_backward=False)
 def _mark_boxes(
-    # inputs:
     rank: int,
     ranks: int,
     level_begin: wp.array[int],
     parent: wp.array[int],
-    # outputs:
     leaves_out: wp.array[int],
     marks_out: wp.array[int],
 ):
@@ -84,14 +81,7 @@ def _mark_boxes(
 
 
 @wp.kernel(module="unique", enable_backward=False)
-def _list_marks(
-    # inputs:
-    octant_begin: wp.array2d[int],
-    order: wp.array[int],
-    marks: wp.array[int],
-    # outputs:
-    marks_out: wp.array[int],
-):
+def _list_marks(octant_begin: wp.array2d[int], order: wp.array[int], marks: wp.array[int], marks_out: wp.array[int]):
     i = wp.tid()
     mark = int(0)
     if i < octant_begin[octant_begin.shape[0] - 1, 8]:
@@ -101,12 +91,10 @@ def _list_marks(
 
 @wp.kernel(module="unique", enable_backward=False)
 def _choose_boxes(
-    # inputs:
     octant_begin: wp.array2d[int],
     order: wp.array[int],
     marks: wp.array[int],
     marks_before: wp.array[int],
-    # outputs:
     order_out: wp.array[int],
     octant_begin_out: wp.array2d[int],
 ):

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
-from warpmag.kernels.shared.team import team, threads_for
+from warpmag.kernels.shared.team import launch_passes, threads_for
 
 _BOXES_PER_THREAD = 64
 """Boxes per thread of a CPU, at least."""
@@ -67,8 +67,6 @@ class Translation:
     Args:
         matrices: Matrix of each displacement, rows are harmonics of the target, shape [56, K, K].
         parity: Signs ±1 of the harmonics under reflections of x, y and z, shape [3, K].
-        dtype: Warp scalar type of the coefficients.
-        device: Warp device.
     """
 
     def __init__(self, matrices, parity, dtype, device):
@@ -139,7 +137,7 @@ class Translation:
             return
         kernel = _cpu_kernel(self._dtype, tuple(self._constants.items()))
         threads = threads_for(boxes, _BOXES_PER_THREAD)
-        wp.launch(kernel, dim=1, inputs=[0, 1, threads, team(), arrays], device=self._device)
+        launch_passes(kernel, 0, 1, arrays, device=self._device, threads=threads)
 
     def _launch_cuda(self, a, boxes: int):
         """Launch the translation on a GPU, for at most ``boxes`` boxes."""
@@ -204,14 +202,7 @@ def _cuda_kernel(dtype, splits: int, constants):
 @cache
 def _add_kernel(dtype):
     @wp.kernel(module="unique", enable_backward=False)
-    def add_parts(
-        # inputs:
-        octant_begin: wp.array2d[int],
-        width: int,
-        parts: wp.array2d[dtype],
-        # outputs:
-        locals_out: wp.array[dtype],
-    ):
+    def add_parts(octant_begin: wp.array2d[int], width: int, parts: wp.array2d[dtype], locals_out: wp.array[dtype]):
         i = wp.tid()
         if i >= octant_begin[octant_begin.shape[0] - 1, 8] * width:  # beyond the last box
             return

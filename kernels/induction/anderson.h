@@ -19,8 +19,8 @@ CUDA_CALLABLE inline int slot_of(int newest, int age) { return (newest - age + D
 // Column of ⟨φΔr_a, φΔr_b⟩ among the sums, a ≤ b.
 CUDA_CALLABLE inline constexpr int matrix_column(int a, int b) { return DEPTH + a * DEPTH - a * (a - 1) / 2 + b - a; }
 
-// Coefficients α_j of the last ``kept`` changes; zeros if the changes are linearly dependent.
-CUDA_CALLABLE inline wp::vec_t<DEPTH, double> solve_anderson(const double* sums, int kept) {
+// Coefficients α_j of the last ``count`` changes; zeros if the changes are linearly dependent.
+CUDA_CALLABLE inline wp::vec_t<DEPTH, double> solve_anderson(const double* sums, int count) {
 #if !defined(__CUDA_ARCH__)
 #pragma clang fp contract(off) // same rounding on every CPU where changes are nearly dependent
 #endif
@@ -28,10 +28,10 @@ CUDA_CALLABLE inline wp::vec_t<DEPTH, double> solve_anderson(const double* sums,
     bool regular = true;
 #pragma unroll
     for (int a = 0, column = DEPTH; a < DEPTH; ++a) {
-        x[a] = a < kept ? sums[a] : 0.0;
+        x[a] = a < count ? sums[a] : 0.0;
 #pragma unroll
         for (int b = a; b < DEPTH; ++b, ++column)
-            m[a][b] = b < kept ? sums[column] * (a == b ? 1.0 + RIDGE : 1.0) : (a == b ? 1.0 : 0.0);
+            m[a][b] = b < count ? sums[column] * (a == b ? 1.0 + RIDGE : 1.0) : (a == b ? 1.0 : 0.0);
     }
     // Gaussian elimination in the upper triangle of a symmetric positive definite matrix
 #pragma unroll

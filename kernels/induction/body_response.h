@@ -27,7 +27,7 @@ inline void wait_for_body() {}
 #endif
 
 // A body, and the memory that its threads share: a vector per cell, and partial sums.
-struct Body {
+struct InducibleBody {
     int cells;
     const Real *full, *pair_law; // tables of tensors, as in body_response.py
     Real* vectors;
@@ -45,14 +45,14 @@ struct Cell {
 };
 
 // Calls visit(cell) for the vectors of cells of this thread.
-template <class Visit> CUDA_CALLABLE inline void for_cells(const Body& body, Cell* cells, Visit visit) {
+template <class Visit> CUDA_CALLABLE inline void for_cells(const InducibleBody& body, Cell* cells, Visit visit) {
 #pragma unroll
     for (int k = 0; k < VECTORS; ++k)
         if (k < vectors_of(body.cells)) visit(cells[k]);
 }
 
 // Σ_j T_ij v_j by a table, of the vectors in shared memory.
-CUDA_CALLABLE inline Vector sum_cells(const Body& body, const Real* table, int cell) {
+CUDA_CALLABLE inline Vector sum_cells(const InducibleBody& body, const Real* table, int cell) {
     const Real* const rows = table + (size_t)(cell / CHUNK) * (COMPONENTS * CHUNK) * body.cells + cell % CHUNK;
     const int end = cell < body.cells ? body.cells : 0;
     Vector h = {0, 0, 0};
@@ -68,7 +68,8 @@ CUDA_CALLABLE inline Vector sum_cells(const Body& body, const Real* table, int c
 }
 
 // Sets each cell's field to the body's own field for moments vector(cell): T m less the hardness term.
-template <class VectorOf> CUDA_CALLABLE inline void apply_tensors(const Body& body, Cell* cells, VectorOf vector) {
+template <class VectorOf>
+CUDA_CALLABLE inline void apply_tensors(const InducibleBody& body, Cell* cells, VectorOf vector) {
     wait_for_body();
     for_cells(body, cells, [&](Cell& cell) {
         cell.field = vector(cell);
@@ -87,7 +88,8 @@ struct Pair {
 };
 
 // Sums of two numbers of each cell over the body, returned to all of its threads.
-template <class NumbersOf> CUDA_CALLABLE inline Pair sums_of_body(const Body& body, Cell* cells, NumbersOf numbers_of) {
+template <class NumbersOf>
+CUDA_CALLABLE inline Pair sums_of_body(const InducibleBody& body, Cell* cells, NumbersOf numbers_of) {
     Pair total = {0, 0};
 #if defined(__CUDA_ARCH__)
     if (cells[0].at.count > 0 && share() == 0) numbers_of(cells[0], total.first, total.second);
@@ -131,7 +133,7 @@ CUDA_CALLABLE inline void set_weights(Cell& cell) {
 
 // One step of Newton's method from s with residual r: s ← s + r + (k/Ms) T E z. Conjugate gradients with one reduction
 // per step solve (1 − E T E) z = E r Ms/k (Chronopoulos and Gear 1989).
-CUDA_CALLABLE inline void newton_step(const Body& body, Cell* cells) {
+CUDA_CALLABLE inline void newton_step(const InducibleBody& body, Cell* cells) {
     for_cells(body, cells, [&](Cell& cell) {
         set_weights(cell);
         cell.s += cell.residual;
@@ -166,8 +168,8 @@ CUDA_CALLABLE inline void newton_step(const Body& body, Cell* cells) {
 
 // Subtracts ``weight`` times the body's own field at its ``past`` solution from the outside field.
 template <class State, class Bodies>
-CUDA_CALLABLE inline void subtract_own_field(State& state, const Bodies& bodies, int b, const Body& body, Cell* cells,
-                                             int past, Real weight) {
+CUDA_CALLABLE inline void subtract_own_field(State& state, const Bodies& bodies, int b, const InducibleBody& body,
+                                             Cell* cells, int past, Real weight) {
     const Rotation rotation = rotation_of(bodies.past.data[past * bodies.body.shape[0] + b]);
     apply_tensors(body, cells, [&](const Cell& cell) {
         return moments_of(cell.material, cell.radius, to_body(rotation, get(state.past_g, cell.at, past)));
@@ -178,7 +180,7 @@ CUDA_CALLABLE inline void subtract_own_field(State& state, const Bodies& bodies,
 // Reads the cells of body b, with the summed field as outside field. At the start of a solve the outside field is the
 // applied field, or is extrapolated from the last solves.
 template <class State, class Bodies>
-CUDA_CALLABLE inline void read_cells(State& state, const Bodies& bodies, int b, const Body& body, Cell* cells,
+CUDA_CALLABLE inline void read_cells(State& state, const Bodies& bodies, int b, const InducibleBody& body, Cell* cells,
                                      bool begin, const Rotation& rotation) {
     const auto& row = bodies.body.data[b]; // first moment, cells, world, index of the rotation
     const bool steady = begin && state.warm.data[row[2]] == STEADY;
@@ -211,7 +213,7 @@ CUDA_CALLABLE inline void respond(State& state, const Bodies& bodies, int b, boo
     const auto& row = bodies.body.data[b]; // first moment, cells, world, index of the rotation
     if (!state.worlds.data[row[2]].active) return;
     const Real* const table = bodies.tensor.data + bodies.table.data[b];
-    const Body body = {row[1], table, table + bodies.pair_law.data[b], vectors, parts};
+    const InducibleBody body = {row[1], table, table + bodies.pair_law.data[b], vectors, parts};
     const auto now = bodies.rotation.data[row[3]];
     const Rotation rotation = rotation_of(now);
     Cell cells[VECTORS];

@@ -46,21 +46,13 @@ _BODIES_PER_THREAD = 8
 
 @dataclass(frozen=True)
 class RespondingBody:
-    """A body with a collective response.
+    """A body with a collective response."""
 
-    Attributes:
-        first: Its first moment.
-        world: Its world.
-        number: Index of its rotation.
-        row: Its first row in ``hardness``.
-        tensors: Tensors between its n cells, full ones and those of the pair law [1/m³], shape [2, n, n, 6].
-    """
-
-    first: int
-    world: int
-    number: int
-    row: int
-    tensors: np.ndarray
+    first: int  # its first moment
+    world: int  # its world
+    number: int  # index of its rotation
+    row: int  # its first row in ``hardness``
+    tensors: np.ndarray  # tensors between its n cells, full ones and those of the pair law [1/m³], shape [2, n, n, 6]
 
     @property
     def cell_count(self) -> int:
@@ -70,19 +62,20 @@ class RespondingBody:
 
 @cache
 def responses_type(dtype):
-    """Return the struct of the bodies; :class:`BodyResponses` describes its arrays."""
+    """Return the struct of b bodies with a collective response."""
     quaternion = wp.types.quaternion(dtype)
 
     @wp.struct
     class Bodies:
-        body: wp.array[wp.vec4i]
-        row: wp.array[int]
-        table: wp.array[int]
-        pair_law: wp.array[int]
-        tensor: wp.array[dtype]
+        body: wp.array[wp.vec4i]  # first moment, number of cells, world, and index of the rotation, shape [b]
+        row: wp.array[int]  # first row in ``hardness``, shape [b]
+        table: wp.array[int]  # begin of the shape's tensors in ``tensor``, shape [b]
+        pair_law: wp.array[int]  # offset from there to the tensors of the pair law, shape [b]
+        tensor: wp.array[dtype]  # the tables
+        # Arrays of all bodies with cells (``cells.couplings``).
         hardness: wp.array[dtype]
         rotation: wp.array[quaternion]
-        past: wp.array2d[quaternion]
+        past: wp.array2d[quaternion]  # rotations at the last two solves, the last first, shape [2, b]
 
     return Bodies
 
@@ -108,16 +101,6 @@ def _table(tensors: np.ndarray) -> np.ndarray:
 class BodyResponses:
     """Collective responses of b bodies, in arrays that all launches share.
 
-    Arrays of the struct:
-
-        body: First moment, number of cells, world, and index of the rotation, shape [b].
-        row: First row in ``hardness``, shape [b].
-        table: Begin of the shape's tensors in ``tensor``, shape [b].
-        pair_law: Offset from there to the tensors of the pair law, shape [b].
-        tensor: The tables.
-        hardness, rotation: Arrays of all bodies with cells (``cells.couplings``).
-        past: Rotations at the last two solves, the last first, shape [2, b].
-
     Attributes:
         begin: Launch that starts from the response to the extrapolated field.
         respond: Launch that replaces the field at cells by the field after their response.
@@ -128,7 +111,6 @@ class BodyResponses:
         """Copy the tables to the device, and mark the cells in the state of the solve.
 
         Args:
-            state: State of the solve (``solve_state``).
             bodies: The bodies; bodies with the same ``tensors`` object share a table.
             cells: The couplings of the bodies' cells (``CellCouplings``).
         """
@@ -165,6 +147,6 @@ class BodyResponses:
         inputs = [begin, threads, team() if device.is_cpu else None, self._bodies, state]
         return wp.launch(kernel, dim=dim, inputs=inputs, block_dim=block, device=device, record_cmd=True)
 
-    def carried(self) -> dict:
+    def persistent_arrays(self) -> dict:
         """Return the arrays that persist from one solve to the next, by name."""
         return {"past": self._bodies.past}

@@ -36,7 +36,6 @@ def _energy_kernel(dtype):
 
     @wp.kernel(module="unique", enable_backward=False, module_options=native_options("material/curves.h", dtype=dtype))
     def energy(
-        # inputs:
         inducible: wp.array[int],
         radii: wp.array[dtype],
         moments: wp.array[vec3],
@@ -48,7 +47,6 @@ def _energy_kernel(dtype):
         h0: wp.array[vec3],
         h_permanent: wp.array[vec3],
         external_field: wp.array[vec3],
-        # outputs:
         energy_out: wp.array[wp.float64],
     ):
         i = wp.tid()
@@ -69,19 +67,11 @@ def launch_energy(radii, moments, material, h, h0, h_permanent, external_field, 
     """Launch each moment's share of the energy [J].
 
     Args:
-        radii: Radii of the moments' balls [m], shape [n].
-        moments: Moments in equilibrium [A·m²], shape [n].
         material: Materials of the moments (``curves.CurveParameters``).
         h, h0: Total and applied field at the inducible moments [A/m], shape [n].
         h_permanent: Field of other permanent moments at permanent moments [A/m], shape [n].
-        external_field: External field [A/m], shape [n].
         energies: Out: energies, float64, shape [n].
     """
     inputs = [material.inducible, radii, moments, material.saturation, material.slope, material.curve, material.tables]
-    wp.launch(
-        _energy_kernel(radii.dtype),
-        dim=len(radii),
-        inputs=[*inputs, h, h0, h_permanent, external_field],
-        outputs=[energies],
-        device=radii.device,
-    )
+    inputs += [h, h0, h_permanent, external_field]
+    wp.launch(_energy_kernel(radii.dtype), len(radii), inputs=inputs, outputs=[energies], device=radii.device)

@@ -12,10 +12,10 @@ enum Next { NOTHING, DEMAGNETIZE, STEP_FROM_BEST, STEP, STEP_AND_SWEEP }; // nex
 template <class State> CUDA_CALLABLE inline void begin_world(State& state, int w) {
     auto& world = state.worlds.data[w];
     world.active = state.condition.data[0] = 1;
-    world.evaluations = world.linked = world.plain_steps = 0;
+    world.evaluations = world.has_change = world.plain_steps = 0;
     world.next = state.warm.data[w] == STEADY ? STEP_AND_SWEEP : NOTHING;
     world.best = -1.0, world.damping = 1.0;
-    if (state.warm.data[w] == 0) world.kept = 0, world.slowness = 0.0;
+    if (state.warm.data[w] == 0) world.change_count = 0, world.slowness = 0.0;
 }
 
 // Residual (Eq. 12) from ‖M − f(H)‖² and ‖f(H)‖²: relative, or absolute where there is no field.
@@ -28,7 +28,7 @@ CUDA_CALLABLE inline double relative_residual(double deviation2, double goal2) {
 // next solve starts cold.
 template <class State>
 CUDA_CALLABLE inline bool check_convergence(State& state, int w, double residual, double error, bool finite,
-                                            bool hopeless) {
+                                            bool failed) {
     auto& world = state.worlds.data[w];
     const bool converged = error <= state.rtol;
     world.evaluations += 1;
@@ -37,7 +37,7 @@ CUDA_CALLABLE inline bool check_convergence(State& state, int w, double residual
     state.error.data[w] = error;
     state.evaluations.data[w] = world.evaluations;
     state.converged.data[w] = converged;
-    const bool done = converged || world.evaluations >= state.max_evaluations || hopeless;
+    const bool done = converged || world.evaluations >= state.max_evaluations || failed;
     if (done) {
         int& warm = state.warm.data[w];
         warm = !finite ? 0 : warm < STEADY ? warm + 1 : STEADY;

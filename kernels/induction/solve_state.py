@@ -2,41 +2,6 @@
 
 ``theta_flow`` and the baselines in ``submagnetization`` move the moments. Each world iterates and converges on its own
 (``solve_state.h``). Sums run over fixed chunks of a world's moments in a fixed order, in float64.
-
-The state of n moments, m of them inducible, in w worlds and c chunks:
-
-    packed, moments: Moments, packed and plain [A·m²], shapes [8, n] and [n]; inducible ones are written.
-    neighbor, neighbor_count, overlap, overlap_count, searching: Lists of neighbors (``PackedMoments``).
-    saturation, slope, curve: Materials (``curves.CurveParameters``).
-    rtol: Error at which a world ends.
-    max_evaluations: Field evaluations after which a world ends unconverged.
-    responds: 1 for cells of bodies with a collective response (``body_response``), shape [n].
-    row: Moment, world, and range of the world's inducible moments, for each inducible moment, shape [m].
-    chunk: Range of rows, and world, of each chunk, shape [c].
-    chunk_begin: First chunk of each world, shape [w + 1].
-    near: On a CPU rows of the neighbors of a chunk's moments, shape [c, CAPACITY, CHUNK].
-    near_count: Length of the longest list of each vector.
-    h0: Applied field [A/m], external and of permanent magnets, shape [n].
-    h: Total field [A/m], shape [n].
-    s: Dual variable [dimensionless], shape [n].
-    iterate_s, iterate_r: Last iterate, and its residual, shape [n].
-    history_s, history_r: Last changes of both from one evaluation to the next, shape [DEPTH, n].
-    best_s, best_r: Iterate of the smallest merit, and its residual, shape [n].
-    step: Step length of each moment, shape [n].
-    mixed_g: Reduced field of the mixed iterate, without the changes that the sweeps add, shape [n].
-    mixed_moment: Moments of the mixed iterate [A·m²], shape [n].
-    past_field, past_g: Field of the inducible moments at the last two solutions [A/m], and the reduced total field; the
-        last first, shape [2, n].
-    past: Position [m], radius and moment [A·m²] of each row at these solutions, shape [rows, LINE].
-    now, swept: Position [m], radius, and change of moment by a step or by the first sweep, shape [rows, LINE].
-    sums: Sums of each chunk, on a CPU of each vector, shape [c, COLUMNS].
-    arrived: Number of each world's chunks whose sums are complete, shape [w].
-    worlds: State of each world, shape [w].
-    warm: Number of solves of each world since its cold start, at most ``STEADY``, shape [w].
-    residual: Relative residual ‖M − f(H)‖/‖f(H)‖ of each world after its last evaluation, shape [w].
-    error: Relative error of each world: the estimate of ``theta_flow``, or the residual of a baseline, shape [w].
-    evaluations, converged: Number of evaluations of the last solve, and 1 if it converged, shape [w].
-    condition: 1 while any world iterates, shape [1].
 """
 
 from functools import cache
@@ -58,98 +23,95 @@ BLOCK_CHUNK = 128
 
 @wp.struct
 class World:
-    """State of a world between evaluations; the fields that every moment reads share a cache line.
+    """State of a world between evaluations; the fields that every moment reads share a cache line."""
 
-    Attributes:
-        active: 1 while it iterates.
-        evaluations: Field evaluations of this solve.
-        in_field: 1 if there is an applied field, 0 after the first evaluation.
-        next: Its next action, of ``Next`` in ``solve_state.h``.
-        linked: 1 if the change from the last iterate to the next one is stored.
-        kept: Number of stored changes in ``history``.
-        newest: Slot of the newest stored change.
-        used: Number of changes that the next step mixes.
-        improved: 1 if the last iterate is the best so far.
-        plain_steps: Steps left without mixing.
-        damping: Factor of the moments' step lengths.
-        ahead: Factor β of the last change from solve to solve in the next start.
-        best: Smallest merit of this solve, negative before the first evaluation.
-        alpha: Anderson coefficients.
-        slowness: Predicted sum of the remaining steps over the last step.
-        gain: Size of each stored change of the iterate over that of its residual, by slot.
-    """
-
-    active: int
-    evaluations: int
-    in_field: int
-    next: int
-    linked: int
-    kept: int
-    newest: int
-    used: int
-    improved: int
-    plain_steps: int
-    damping: wp.float64
-    ahead: wp.float64
-    best: wp.float64
-    alpha: wp.types.vector(DEPTH, wp.float64)
-    slowness: wp.float64
+    active: int  # 1 while it iterates
+    evaluations: int  # field evaluations of this solve
+    in_field: int  # 1 if there is an applied field, 0 after the first evaluation
+    next: int  # its next action, of ``Next`` in ``solve_state.h``
+    has_change: int  # 1 if the change from the last iterate to the next one is stored
+    change_count: int  # number of stored changes in ``history``
+    newest: int  # slot of the newest stored change
+    used: int  # number of changes that the next step mixes
+    is_best: int  # 1 if the last iterate is the best so far
+    plain_steps: int  # steps left without mixing
+    damping: wp.float64  # factor of the moments' step lengths
+    ahead: wp.float64  # factor β of the last change from solve to solve in the next start
+    best: wp.float64  # smallest merit of this solve, negative before the first evaluation
+    alpha: wp.types.vector(DEPTH, wp.float64)  # Anderson coefficients
+    slowness: wp.float64  # predicted sum of the remaining steps over the last step
+    # Size of each stored change of the iterate over that of its residual, by slot.
     gain: wp.types.vector(DEPTH, wp.float64)
 
 
 @cache
 def state_type(dtype):
-    """Return the struct of a solve's state; the module describes its arrays."""
+    """Return the struct of the state of n moments, m of them inducible, in w worlds and c chunks."""
     vec3 = wp.types.vector(3, dtype)
 
     @wp.struct
     class SolveState:
+        # Moments, packed and plain [A·m²], shapes [8, n] and [n]; inducible ones are written.
         packed: wp.array2d[dtype]
         moments: wp.array[vec3]
+        # Lists of neighbors (``PackedMoments``).
         neighbor: wp.array2d[int]
         neighbor_count: wp.array[int]
         overlap: wp.array2d[int]
         overlap_count: wp.array[int]
         searching: wp.array[int]
+        # Materials (``curves.CurveParameters``).
         saturation: wp.array[dtype]
         slope: wp.array[dtype]
         curve: wp.array[int]
         common_curve: int
         curve_tables: wp.array2d[dtype]
-        responds: wp.array[int]
-        rtol: wp.float64
-        max_evaluations: int
+        responds: wp.array[int]  # 1 for cells of bodies with a collective response (``body_response``), shape [n]
+        rtol: wp.float64  # error at which a world ends
+        max_evaluations: int  # field evaluations after which a world ends unconverged
+        # Moment, world, and range of the world's inducible moments, for each inducible moment, shape [m].
         row: wp.array[wp.vec4i]
-        chunk: wp.array[wp.vec3i]
-        chunk_begin: wp.array[int]
-        near: wp.array3d[int]
-        near_count: wp.array[int]
-        h0: wp.array[vec3]
-        h: wp.array[vec3]
-        s: wp.array[vec3]
+        chunk: wp.array[wp.vec3i]  # range of rows, and world, of each chunk, shape [c]
+        chunk_begin: wp.array[int]  # first chunk of each world, shape [w + 1]
+        near: wp.array3d[int]  # on a CPU rows of the neighbors of a chunk's moments, shape [c, CAPACITY, CHUNK]
+        near_count: wp.array[int]  # length of the longest list of each vector
+        h0: wp.array[vec3]  # applied field [A/m], external and of permanent magnets, shape [n]
+        h: wp.array[vec3]  # total field [A/m], shape [n]
+        s: wp.array[vec3]  # dual variable [dimensionless], shape [n]
+        # Last iterate, and its residual, shape [n].
         iterate_s: wp.array[vec3]
         iterate_r: wp.array[vec3]
+        # Last changes of both from one evaluation to the next, shape [DEPTH, n].
         history_s: wp.array2d[vec3]
         history_r: wp.array2d[vec3]
+        # Iterate of the smallest merit, and its residual, shape [n].
         best_s: wp.array[vec3]
         best_r: wp.array[vec3]
+        # Reduced field of the mixed iterate, without the changes that the sweeps add, shape [n].
         mixed_g: wp.array[vec3]
-        mixed_moment: wp.array[vec3]
+        mixed_moment: wp.array[vec3]  # moments of the mixed iterate [A·m²], shape [n]
+        # Field of the inducible moments at the last two solutions [A/m], and the reduced total field; the last first,
+        # shape [2, n].
         past_field: wp.array2d[vec3]
         past_g: wp.array2d[vec3]
-        step: wp.array[dtype]
+        step: wp.array[dtype]  # step length of each moment, shape [n]
+        # Position [m], radius and moment [A·m²] of each row at these solutions, shape [rows, LINE].
         past: wp.array2d[dtype]
+        # Position [m], radius, and change of moment by a step or by the first sweep, shape [rows, LINE].
         now: wp.array2d[dtype]
         swept: wp.array2d[dtype]
-        sums: wp.array2d[wp.float64]
-        arrived: wp.array[int]
-        worlds: wp.array[World]
-        warm: wp.array[int]
+        sums: wp.array2d[wp.float64]  # sums of each chunk, on a CPU of each vector, shape [c, COLUMNS]
+        arrived: wp.array[int]  # number of each world's chunks whose sums are complete, shape [w]
+        worlds: wp.array[World]  # state of each world, shape [w]
+        warm: wp.array[int]  # number of solves of each world since its cold start, at most ``STEADY``, shape [w]
+        # Relative residual ‖M − f(H)‖/‖f(H)‖ of each world after its last evaluation, shape [w].
         residual: wp.array[wp.float64]
+        # Relative error of each world: the estimate of ``theta_flow``, or the residual of a baseline, shape [w].
         error: wp.array[wp.float64]
+        # Number of evaluations of the last solve, and 1 if it converged, shape [w].
         evaluations: wp.array[int]
         converged: wp.array[int]
-        condition: wp.array[int]
+        condition: wp.array[int]  # 1 while any world iterates, shape [1]
 
     return SolveState
 
@@ -160,8 +122,6 @@ def allocate(worlds, inducible, dtype, device):
     Args:
         worlds: World of each moment, non-decreasing, shape [n].
         inducible: True for inducible moments, shape [n]; in each world inducible moments come first.
-        dtype: Warp scalar type.
-        device: Warp device.
     """
     n, world_count = len(worlds), int(worlds[-1]) + 1 if len(worlds) else 0
     on_cpu = wp.get_device(device).is_cpu
@@ -207,7 +167,7 @@ def allocate(worlds, inducible, dtype, device):
     return state
 
 
-def carried_arrays(state) -> dict:
+def persistent_arrays(state) -> dict:
     """Return the arrays of a state that persist from one solve to the next, by name."""
     names = "near near_count s iterate_s iterate_r history_s history_r best_s best_r mixed_g mixed_moment past_field"
     names += " past_g past now swept worlds warm residual error evaluations converged"
@@ -218,8 +178,6 @@ def bind(state, packed, material, moments, rtol: float, max_evaluations: int) ->
     """Set the moments of a solve, and the limits at which it ends.
 
     Args:
-        state: State of the solve.
-        packed: All moments, packed (``PackedMoments``).
         material: Materials of the moments (``curves.CurveParameters``).
         moments: Moments [A·m²], shape [n].
         rtol: Error at which a world ends.
@@ -286,14 +244,9 @@ def _bias_kernel(vec3):
 
 
 def launch_add_bias(bias, moments, h0):
-    """Add the bias M_r/χ of permanent magnets that respond to the field, M = M_r + χ H' with the inner field H'.
+    """Add the bias M_r/χ [A/m] of permanent magnets that respond to the field, M = M_r + χ H' with the inner field H'.
 
     The curve of such a magnet's ball is M = k (H + M_r/χ), k = 3χ/(3 + χ): linear in the field H plus a bias. The bias
-    is part of a solve's applied field only, and exerts no force.
-
-    Args:
-        bias: M_r/χ [A/m], shape [n].
-        moments: Indices of the moments that have a bias.
-        h0: Applied field [A/m], shape [n].
+    is part of a solve's applied field ``h0`` only, and exerts no force. ``moments`` are the indices that have a bias.
     """
     wp.launch(_bias_kernel(h0.dtype), dim=len(moments), inputs=[bias, moments, h0], device=h0.device)

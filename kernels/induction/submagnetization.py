@@ -108,21 +108,13 @@ def pairs_type(dtype):
 
     @wp.struct
     class Pairs:
-        """Pairs of submagnetizations, and parameters of their dynamics.
+        """Pairs of submagnetizations, and parameters of their dynamics."""
 
-        Attributes:
-            first: Directions M1/Ms, shape [n].
-            second: Directions M2/Ms, shape [n].
-            law: ``THETA_EULER``, ``LLG`` or ``LLG_DAMPING``.
-            kappa: Step κ = βΔtMs [dimensionless].
-            precession: Ratio of precession to damping, 1/α or 0 [dimensionless].
-        """
-
-        first: wp.array[vec3]
-        second: wp.array[vec3]
-        law: int
-        kappa: dtype
-        precession: dtype
+        first: wp.array[vec3]  # directions M1/Ms, shape [n]
+        second: wp.array[vec3]  # directions M2/Ms, shape [n]
+        law: int  # ``THETA_EULER``, ``LLG`` or ``LLG_DAMPING``
+        kappa: dtype  # step κ = βΔtMs [dimensionless]
+        precession: dtype  # ratio of precession to damping, 1/α or 0 [dimensionless]
 
     return Pairs
 
@@ -271,11 +263,6 @@ def launch_begin(state, pairs):
 def launch_iteration(state, pairs):
     """Launch the check of convergence in the field ``state.h``, and a step of the pairs of worlds that iterate on."""
     state.condition.zero_()  # set again by any world that needs another evaluation
-    wp.launch_tiled(
-        _convergence_kernel(state.packed.dtype),
-        dim=[state.chunk.shape[0]],
-        inputs=[state, pairs],
-        block_dim=BLOCK_CHUNK,
-        device=state.h.device,
-    )
+    kernel, chunks = _convergence_kernel(state.packed.dtype), state.chunk.shape[0]
+    wp.launch_tiled(kernel, [chunks], inputs=[state, pairs], block_dim=BLOCK_CHUNK, device=state.h.device)
     _launch(_step_kernel, state, state, pairs)

@@ -272,7 +272,7 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     const Vector s = get(state.s, at), g = material.slope / material.saturation * get(state.h, at);
     const Vector r = g - s;
     Vector step = {0, 0, 0};
-    if (world.linked) {
+    if (world.has_change) {
         step = s - get(state.iterate_s, at);
         set(state.history_s, at, step, history.newest);
         set(state.history_r, at, r - get(state.iterate_r, at), history.newest);
@@ -300,7 +300,7 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     Vector change[DEPTH];
 #pragma unroll
     for (int a = 0; a < DEPTH; ++a) {
-        if (a >= history.kept) continue;
+        if (a >= history.count) continue;
         change[a] = get(state.history_r, at, slot_of(history.newest, a));
         put(PRODUCTS + a, square * wide_dot(change[a], r));
 #pragma unroll
@@ -336,7 +336,7 @@ template <class State> CUDA_CALLABLE inline void advance(State& state, const Spa
     } else if (world.next != DEMAGNETIZE) {
         mixed = get(state.iterate_s, at);
         r = get(state.iterate_r, at);
-        if (world.improved) {
+        if (world.is_best) {
             set(state.best_s, at, mixed);
             set(state.best_r, at, r);
         }

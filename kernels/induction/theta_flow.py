@@ -60,7 +60,7 @@ from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel, native_options
 from warpmag.kernels.shared.reductions import group_threads
-from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
+from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, launch_passes, threads_for
 
 START, FIRST_SWEEP, LAST_SWEEP, MEASURE, CHOOSE, ADVANCE = range(6)
 """Passes in order; as in ``theta_flow.h``."""
@@ -179,33 +179,25 @@ def _set_kernel(dtype):
 
 def launch_set_state(state, magnetizations):
     """Launch the start of the next solve from magnetizations [A/m], shape [n], as the last solution of all worlds."""
-    wp.launch(
-        _set_kernel(state.packed.dtype), dim=state.row.shape[0], inputs=[magnetizations, state], device=state.h.device
-    )
+    kernel, rows = _set_kernel(state.packed.dtype), state.row.shape[0]
+    wp.launch(kernel, dim=rows, inputs=[magnetizations, state], device=state.h.device)
 
 
 class Launches:
     """Recorded launches of the flow on one state, which saves packing its arrays each time."""
 
     def __init__(self, state, bodies: BodyResponses | None):
-        """Record the launches for a state that is bound to its moments (``solve_state.bind``).
-
-        Args:
-            state: The state.
-            bodies: Bodies with a collective response; None without them.
-        """
+        """Record the launches for a state bound to its moments (``solve_state.bind``); ``bodies`` may be None."""
         device, dtype, count, chunks = state.h.device, state.packed.dtype, state.row.shape[0], state.chunk.shape[0]
         group, responding = group_threads(device), bodies is not None
 
         def record(kernel, dim, *inputs, block_dim=256):
-            return wp.launch(
-                kernel, dim=dim, inputs=[*inputs, state], block_dim=block_dim, device=device, record_cmd=True
-            )
+            options = dict(block_dim=block_dim, device=device, record_cmd=True)
+            return wp.launch(kernel, dim=dim, inputs=[*inputs, state], **options)
 
         def passes(first: int, last: int):
-            return record(
-                _passes_kernel(dtype, responding), 1, first, last + 1, threads_for(count, MOMENTS_PER_THREAD), team()
-            )
+            kernel, threads = _passes_kernel(dtype, responding), threads_for(count, MOMENTS_PER_THREAD)
+            return launch_passes(kernel, first, last + 1, state, device=device, threads=threads, record_cmd=True)
 
         if device.is_cpu:
             self.begin, self.sweeps = [passes(START, START)], [passes(FIRST_SWEEP, LAST_SWEEP)]

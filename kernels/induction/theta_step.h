@@ -32,20 +32,20 @@ template <class S, class N> CUDA_CALLABLE inline N whole_step(N step) {
 
 // Stored changes from iterate to iterate: their number, and the slot of the newest.
 struct History {
-    int kept, newest;
+    int count, newest;
 };
 
 // History of a world, with the change to the present iterate.
 template <class World> CUDA_CALLABLE inline History history_of(const World& world) {
-    const int kept = world.kept + world.linked;
-    return {kept < DEPTH ? kept : DEPTH, (world.newest + world.linked) % DEPTH};
+    const int count = world.change_count + world.has_change;
+    return {count < DEPTH ? count : DEPTH, (world.newest + world.has_change) % DEPTH};
 }
 
 // Updates the world's rate of convergence, and the gain ‖φΔs‖/‖φΔr‖ of its last change.
 template <class World>
 CUDA_CALLABLE inline void update_estimates(World& world, const History& history, const double* sums, double merit) {
     world.newest = history.newest;
-    if (world.linked) {
+    if (world.has_change) {
         const double change = sums[PRODUCTS + matrix_column(0, 0)];
         world.gain[history.newest] = change > 0.0 ? wp::sqrt(sums[CHANGE] / change) : 0.0;
     }
@@ -60,20 +60,20 @@ CUDA_CALLABLE inline void update_estimates(World& world, const History& history,
 template <class World>
 CUDA_CALLABLE inline bool mix(World& world, const History& history, const double* sums, double merit, bool finite) {
     const bool first = world.best < 0.0;
-    world.improved = 0;
+    world.is_best = 0;
     // Plain steps descend in energy even where the merit grows, so only accelerated steps are checked.
     if (!finite || (!first && world.plain_steps == 0 && merit > 2.0 * world.best)) {
         world.plain_steps = PLAIN_STEPS;
         return false;
     }
     if (world.plain_steps > 0) world.plain_steps -= 1;
-    const bool descended = world.plain_steps == 0 && history.kept == DEPTH && world.used == 0;
+    const bool descended = world.plain_steps == 0 && history.count == DEPTH && world.used == 0;
     if (first || merit < world.best || descended) {
         world.best = merit;
-        world.improved = 1;
+        world.is_best = 1;
         world.plain_steps = 0;
     }
-    world.used = world.plain_steps > 0 ? 0 : history.kept;
+    world.used = world.plain_steps > 0 ? 0 : history.count;
     world.alpha = solve_anderson(sums + PRODUCTS, world.used);
     return true;
 }
@@ -102,12 +102,12 @@ template <class State> CUDA_CALLABLE inline void choose_step(State& state, int w
     auto& world = state.worlds.data[w];
     const History history = history_of(world);
     const double merit = wp::sqrt(sums[MERIT]), residual = relative_residual(sums[DEVIATION], sums[GOAL]);
-    const bool finite = wp::isfinite(merit), hopeless = world.best < 0.0 && !finite;
+    const bool finite = wp::isfinite(merit), failed = world.best < 0.0 && !finite;
     const bool no_field = world.evaluations == 0 && !world.in_field;
     update_estimates(world, history, sums, merit);
     const bool mixed = mix(world, history, sums, merit, finite);
     const double factor = residual > ROUNDING ? amplification(world, sums, merit, mixed) : 1.0;
-    const bool done = check_convergence(state, w, residual, factor * residual, finite, hopeless);
+    const bool done = check_convergence(state, w, residual, factor * residual, finite, failed);
     if (done) {
         const double followed = sums[EARLIER] > 0.0 ? sums[FOLLOWED] / sums[EARLIER] : 0.0;
         world.ahead = followed < 0.0 ? 0.0 : followed > 1.0 ? 1.0 : followed;
@@ -119,7 +119,7 @@ template <class State> CUDA_CALLABLE inline void choose_step(State& state, int w
     if (done && !finite) next = NOTHING;
     if (no_field && !done) next = DEMAGNETIZE;
     world.next = next;
-    world.linked = next >= STEP;
-    world.kept = next >= STEP ? history.kept : 0;
+    world.has_change = next >= STEP;
+    world.change_count = next >= STEP ? history.count : 0;
 }
 }

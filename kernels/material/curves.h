@@ -126,14 +126,14 @@ struct Curves {
     const Real* tables;
 };
 
-// Curves of ``held`` moments from number i on. If ``common`` is MIXED, their ids are read one by one.
-CUDA_CALLABLE inline Curves curves_of(const int* curve, int common, const Real* tables, int i, int held) {
+// Curves of ``lane_count`` moments from number i on. If ``common`` is MIXED, their ids are read one by one.
+CUDA_CALLABLE inline Curves curves_of(const int* curve, int common, const Real* tables, int i, int lane_count) {
 #if defined(__CUDA_ARCH__)
     return {curve[i], curve[i], tables};
 #else
     Index each = common;
     if (common == MIXED)
-        for (int l = 0; l < WIDTH; ++l) each[l] = curve[i + (l < held ? l : 0)];
+        for (int l = 0; l < WIDTH; ++l) each[l] = curve[i + (l < lane_count ? l : 0)];
     return {common, each, tables};
 #endif
 }

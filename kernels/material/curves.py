@@ -48,23 +48,15 @@ _BEYOND = 1e30
 
 @dataclass(frozen=True)
 class CurveParameters:
-    """Magnetization curve of each moment, on one device.
+    """Magnetization curve of each moment, on one device."""
 
-    Attributes:
-        inducible: 1 for inducible moments, 0 for permanent ones, shape [n].
-        saturation: Saturation magnetization Ms [A/m], shape [n].
-        slope: Slope k = 3χ/(3+χ) [dimensionless], the largest of the curve, shape [n].
-        curve: Curve id, one of ``CURVE_IDS``, or ``FIRST_TABLE`` + i for measured curve i of ``tables``, shape [n].
-        common_curve: Common curve id of all inducible moments, or ``MIXED``.
-        tables: Measured curves (:func:`curve_tables`).
-    """
-
-    inducible: wp.array
-    saturation: wp.array
-    slope: wp.array
+    inducible: wp.array  # 1 for inducible moments, 0 for permanent ones, shape [n]
+    saturation: wp.array  # saturation magnetization Ms [A/m], shape [n]
+    slope: wp.array  # slope k = 3χ/(3+χ) [dimensionless], the largest of the curve, shape [n]
+    # Curve id, one of ``CURVE_IDS``, or ``FIRST_TABLE`` + i for measured curve i of ``tables``, shape [n].
     curve: wp.array
-    common_curve: int
-    tables: wp.array
+    common_curve: int  # common curve id of all inducible moments, or ``MIXED``
+    tables: wp.array  # measured curves (:func:`curve_tables`)
 
 
 def curve_tables(measured, dtype, device) -> wp.array:
@@ -73,8 +65,6 @@ def curve_tables(measured, dtype, device) -> wp.array:
     Args:
         measured: Curves, :class:`warpmag.declarations.curves.MagnetizationCurve`: knots ``fields`` and
             ``magnetizations`` [A/m], ``slopes`` dM/dH at them, ``saturation`` [A/m] and the largest ``susceptibility``.
-        dtype: Warp scalar type.
-        device: Warp device.
     """
     longest = max((len(curve.fields) for curve in measured), default=1)
     size = 1 << (longest - 1).bit_length()

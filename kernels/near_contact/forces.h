@@ -7,7 +7,7 @@ namespace warpmag {
 
 // Derivative of ½ e ΔC e by the other ball's position, for the ball's own half of ΔC. ``g`` holds the derivatives of A
 // to P by the distance.
-CUDA_CALLABLE inline Vector contact_force(const Arrays& arrays, const Conductances& f,
+CUDA_CALLABLE inline Vector contact_force(const NearArrays& arrays, const Conductances& f,
                                           const Rows<CONDUCTANCE_SLOPE_ROWS>& g, Vector u, Number inverse,
                                           const Drive& own, const Drive& other) {
     const Number w = own.weight * other.weight;
@@ -31,7 +31,7 @@ CUDA_CALLABLE inline Vector contact_force(const Arrays& arrays, const Conductanc
 }
 
 // Writes the forces of a ball's contacts that the ball's own half of ΔC exerts.
-CUDA_CALLABLE inline void store_contact_forces(const Arrays& a, int i) {
+CUDA_CALLABLE inline void store_contact_forces(const NearArrays& a, int i) {
     Partners<CONTACT_SLOTS> partners(a.near, i);
     const int slots = largest_count(a.contact_count + i);
     const Drive own = drive_at(a, OwnIndices(i).at);
@@ -109,7 +109,7 @@ CUDA_CALLABLE inline Sources in_radii(const Sources& o, Number inverse_radius) {
 }
 
 // Sum of the forces on a ball by its near balls [μ0/4π].
-CUDA_CALLABLE inline Vector sum_forces(const Arrays& a, int i, const Sources& sources) {
+CUDA_CALLABLE inline Vector sum_forces(const NearArrays& a, int i, const Sources& sources) {
     const Number size = numbers(a.radius + i), zero = size * Real(0), square = size * size, inverse_radius = 1 / size;
     const Sources own = in_radii(sources, inverse_radius);
     Vector total = {zero, zero, zero};
@@ -138,7 +138,7 @@ CUDA_CALLABLE inline Vector sum_forces(const Arrays& a, int i, const Sources& so
 }
 
 // Adds forces to movable moments, and torques m × 4π H_near to rotatable ones.
-CUDA_CALLABLE inline void add_forces(const Arrays& a, int i) {
+CUDA_CALLABLE inline void add_forces(const NearArrays& a, int i) {
     const Sources own = sources_at(a, OwnIndices(i).at);
     const Vector force = sum_forces(a, i, own);
     if (share() > 0) return;
@@ -148,7 +148,7 @@ CUDA_CALLABLE inline void add_forces(const Arrays& a, int i) {
 
 // Sweeps, with contact forces in the pass of the last step, then a pass for the sums of forces.
 struct Forces {
-    const Arrays a;
+    const NearArrays a;
     CUDA_CALLABLE void operator()(int pass, int i) const {
         if (pass > 2 * SWEEPS) {
             add_forces(a, i);

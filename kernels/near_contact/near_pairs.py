@@ -37,7 +37,7 @@ from warpmag.kernels.pairs import neighbors
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import CHUNK, LINE, PASS_ARGUMENTS, native_kernel
-from warpmag.kernels.shared.team import team, threads_for
+from warpmag.kernels.shared.team import launch_passes, threads_for
 
 MOST_KINDS = 16
 """Largest number of different susceptibilities; if there are more, quantiles represent all of them."""
@@ -45,7 +45,7 @@ CANDIDATES = 64
 """Capacity of a ball's list of candidates, which are near or may become near."""
 MARGIN = 0.05
 """Fraction of its radius that a ball may move before candidates are searched again."""
-_RATIO = 0.5 * contact_table.REACH + MARGIN
+_SEARCH_RATIO = 0.5 * contact_table.REACH + MARGIN
 NEAR_SLOTS = 32
 """Slots for near balls; balls that do not overlap have at most about 24."""
 CONTACT_SLOTS = 16
@@ -55,23 +55,24 @@ GROUP = 8
 SWEEPS = 2
 """Sweeps before each field evaluation and before forces. With one, a cold solve of a pile takes twice as many
 evaluations."""
-_LAST = 2 * SWEEPS
+_LAST_SWEEP_PASS = 2 * SWEEPS
 """Index of the last pass of the sweeps: each sweep has a pass for the drive and one for the step."""
 _ROWS = dict(
     PAIR_ROWS=8, PAIR_SLOPE_ROWS=2, CONDUCTANCE_ROWS=17, CONDUCTANCE_SLOPE_ROWS=14, STATE_ROWS=16, CACHED_ROWS=24
 )  # fmt: skip
-_WARM = ("state", "last_state", "sources")
+_START_ARRAYS = ("state", "last_state", "sources")
 """Arrays from which the sweeps of the next solve start."""
 _BALLS_PER_THREAD = 500
 """Fewest balls per thread of a CPU."""
 _PAIRS_PER_THREAD = 20000
 """Fewest pairs of a ball and a permanent moment per thread of a CPU: 0.1 ms."""
-_LEAST, _MOST = 0.4, 4.0
+_EIGENVALUES = 0.4, 4.0
 """Bounds of the eigenvalues of 1 + ΔC M, scaled by s, in piles of any permeability, touching or overlapping."""
 
 
 def _constants() -> dict[str, int | float]:
     """Return the constants of the headers."""
+    low, high = (bound**0.5 for bound in _EIGENVALUES)
     first, last, nodes = contact_table.LOG_GAPS
     fades = {name: getattr(contact_table, name) for name in ("MOST_SHARED", "LEAST_RATIO", "CONTACT_GAP", "DEEPEST")}
     fades["QUADRUPOLE_GAP"] = [distance - 2.0 for distance in contact_table.QUADRUPOLE_REACH]
@@ -83,16 +84,15 @@ def _constants() -> dict[str, int | float]:
         NODES_PER_UNIT=(nodes - 1) / (last - first), UNIT=MU0 * INVERSE_4PI,
         # diagonal of M for a ball of unit radius
         OWN_SOURCE=1.0 - 1.2 * 2.0 / contact_table.RANGE, OWN_DIPOLE=1.0 - (2.0 / contact_table.RANGE) ** 3,
-        PACE=4.0 / (_MOST**0.5 + _LEAST**0.5) ** 2,
-        MOMENTUM=((_MOST**0.5 - _LEAST**0.5) / (_MOST**0.5 + _LEAST**0.5)) ** 2,
-        **{f"{name}_LOW": low for name, (low, _) in fades.items()},
-        **{f"{name}_HIGH": high for name, (_, high) in fades.items()},
+        PACE=4.0 / (high + low) ** 2, MOMENTUM=((high - low) / (high + low)) ** 2,
+        **{f"{name}_LOW": value for name, (value, _) in fades.items()},
+        **{f"{name}_HIGH": value for name, (_, value) in fades.items()},
     )  # fmt: skip
 
 
 @cache
 def contact_arrays(dtype) -> Any:
-    """Return the struct of the arrays of scalar type ``dtype``; ``Arrays`` in ``state.h``."""
+    """Return the struct of the arrays of scalar type ``dtype``; ``NearArrays`` in ``state.h``."""
     vec3 = wp.types.vector(3, dtype)
 
     @wp.struct
@@ -153,43 +153,32 @@ def contact_arrays(dtype) -> Any:
 
 @dataclass(frozen=True)
 class NearContactBuffers:
-    """Buffers of the model on a device.
+    """Buffers of the model on a device."""
 
-    Attributes:
-        dtype: Warp scalar type.
-        lists: Neighbor lists of the candidates.
-        arrays: Arrays of the passes, see :func:`contact_arrays`.
-        reach: Distance of the farthest contact [m]; 0 if no moment takes part.
-        threads: Threads of a CPU for passes over near pairs.
-        nonuniform_threads: Threads of a CPU for forces of non-uniform fields; 0 if there are none.
-        stream: Stream of a GPU that runs in parallel with the pair sums.
-        events: Events of that stream: its start, the write of H_near to the field's sums, and its end.
-        commands: Recorded launches, so that the arrays are packed only once.
-    """
-
-    dtype: Any
-    lists: Any
-    arrays: Any
-    reach: float
-    threads: int
-    nonuniform_threads: int
-    stream: wp.Stream | None
+    dtype: Any  # Warp scalar type
+    lists: Any  # neighbor lists of the candidates
+    arrays: Any  # arrays of the passes, see :func:`contact_arrays`
+    reach: float  # distance of the farthest contact [m]; 0 if no moment takes part
+    threads: int  # threads of a CPU for passes over near pairs
+    nonuniform_threads: int  # threads of a CPU for forces of non-uniform fields; 0 if there are none
+    stream: wp.Stream | None  # stream of a GPU that runs in parallel with the pair sums
+    # Events of that stream: its start, the write of H_near to the field's sums, and its end.
     events: tuple[wp.Event, ...]
-    commands: dict
+    commands: dict  # recorded launches, so that the arrays are packed only once
 
     @property
     def device(self):
         """The Warp device."""
         return self.arrays.group.device
 
-    def forget(self):
+    def reset(self):
         """Set the contact sources to zero, so that the next solve starts cold."""
-        for name in _WARM:
+        for name in _START_ARRAYS:
             getattr(self.arrays, name).zero_()
 
-    def carried(self) -> dict:
+    def persistent_arrays(self) -> dict:
         """Return the arrays that persist from one solve to the next, by name."""
-        return neighbors.carried_lists(self.lists) | {name: getattr(self.arrays, name) for name in _WARM}
+        return neighbors.persistent_lists(self.lists) | {name: getattr(self.arrays, name) for name in _START_ARRAYS}
 
 
 def allocate(
@@ -199,7 +188,6 @@ def allocate(
     """Return the buffers.
 
     Args:
-        packed: The moments (``packing.PackedMoments``).
         worlds: World of each moment, shape [n].
         eligible: True for moments that may take part, shape [n].
         susceptibility: Susceptibility of each moment, which may be infinite, shape [n].
@@ -224,7 +212,7 @@ def allocate(
     group = padded(worlds, -1)
     radii = packed.radii.numpy()
     reach = 2.0 * float(np.max(radii, initial=0.0, where=eligible))
-    lists = neighbors.allocate(n, packed.packed, group, reach=reach, ratio=_RATIO, capacity=CANDIDATES)
+    lists = neighbors.allocate(n, packed.packed, group, reach=reach, ratio=_SEARCH_RATIO, capacity=CANDIDATES)
     a = contact_arrays(dtype)()
     a.balls, a.common_curve = balls, material.common_curve
     a.moment_stride = packed.packed.strides[0] // wp.types.type_size_in_bytes(dtype)
@@ -321,19 +309,14 @@ def kernel(dtype, passes: str):
 
 def _launch(buffers: NearContactBuffers, passes: str, first: int, last: int):
     """Launch passes ``first`` to ``last`` − 1: all at once on a CPU, one by one on a GPU."""
-    cpu = buffers.device.is_cpu
     threads = buffers.nonuniform_threads if passes == "NonuniformField" else buffers.threads
-    for begin, end in [(first, last)] if cpu else pairwise(range(first, last + 1)):
+    sizes = dict(threads=threads, gpu_threads=GROUP * buffers.arrays.balls, block_dim=128)
+    for begin, end in [(first, last)] if buffers.device.is_cpu else pairwise(range(first, last + 1)):
         key = passes, begin, end
         if key not in buffers.commands:
-            buffers.commands[key] = wp.launch(
-                kernel(buffers.dtype, passes),
-                dim=1 if cpu else GROUP * buffers.arrays.balls,
-                inputs=[begin, end, threads, team() if cpu else None, buffers.arrays],
-                device=buffers.device,
-                block_dim=128,
-                record_cmd=True,
-            )
+            native, device = kernel(buffers.dtype, passes), buffers.device
+            command = launch_passes(native, begin, end, buffers.arrays, device=device, record_cmd=True, **sizes)
+            buffers.commands[key] = command
         buffers.commands[key].launch()
 
 
@@ -370,12 +353,12 @@ def launch_sweeps(buffers: NearContactBuffers):
     if buffers.reach == 0.0:
         return
     if buffers.stream is None:
-        _launch(buffers, "Sweeps", 0, _LAST + 1)
+        _launch(buffers, "Sweeps", 0, _LAST_SWEEP_PASS + 1)
         return
     with _beside(buffers):
-        _launch(buffers, "Sweeps", 1, _LAST)
+        _launch(buffers, "Sweeps", 1, _LAST_SWEEP_PASS)
         buffers.stream.record_event(buffers.events[1])
-        _launch(buffers, "Sweeps", _LAST, _LAST + 1)
+        _launch(buffers, "Sweeps", _LAST_SWEEP_PASS, _LAST_SWEEP_PASS + 1)
 
 
 def wait_for_field(buffers: NearContactBuffers):
@@ -388,7 +371,7 @@ def launch_begin_forces(buffers: NearContactBuffers):
     """Begin the sweeps for the forces on a GPU, in parallel with the following launches."""
     if buffers.reach > 0.0 and buffers.stream is not None:
         with _beside(buffers):
-            _launch(buffers, "Forces", 1, _LAST + 1)
+            _launch(buffers, "Forces", 1, _LAST_SWEEP_PASS + 1)
 
 
 def launch_add_forces(buffers: NearContactBuffers):
@@ -396,7 +379,7 @@ def launch_add_forces(buffers: NearContactBuffers):
     if buffers.reach == 0.0:
         return
     wait(buffers)
-    _launch(buffers, "Forces", 0 if buffers.stream is None else _LAST + 1, _LAST + 2)
+    _launch(buffers, "Forces", 0 if buffers.stream is None else _LAST_SWEEP_PASS + 1, _LAST_SWEEP_PASS + 2)
     if buffers.nonuniform_threads:
         _launch(buffers, "NonuniformField", 0, 4)
 

@@ -222,7 +222,7 @@ struct Magnet {
     Number size, single;
 };
 CUDA_CALLABLE inline Number broadcast(Real n) { return Number(n); }
-CUDA_CALLABLE inline Magnet magnets(const Arrays& a, int i) {
+CUDA_CALLABLE inline Magnet magnets(const NearArrays& a, int i) {
     const size_t stride = a.moment_stride;
     const Real* row = a.packed + i;
     return {{numbers(row), numbers(row + stride), numbers(row + 2 * stride)},
@@ -231,7 +231,7 @@ CUDA_CALLABLE inline Magnet magnets(const Arrays& a, int i) {
             numbers(a.single + i)};
 }
 // Moment j, the same in all lanes.
-CUDA_CALLABLE inline Magnet magnet(const Arrays& a, int j) {
+CUDA_CALLABLE inline Magnet magnet(const NearArrays& a, int j) {
     const size_t stride = a.moment_stride;
     const Real* row = a.packed + j;
     auto at = [=](int n) -> Number { return broadcast(row[n * stride]); };
@@ -239,7 +239,7 @@ CUDA_CALLABLE inline Magnet magnet(const Arrays& a, int j) {
 }
 
 // Pass 0: finds a ball that encloses the positions of CHUNK moments that take part, and their largest radius.
-CUDA_CALLABLE inline void find_bounds(const Arrays& a, int i) {
+CUDA_CALLABLE inline void find_bounds(const NearArrays& a, int i) {
     if (i % CHUNK != 0 || share() > 0) return;
     const size_t stride = a.moment_stride;
     Real low[3] = {0, 0, 0}, high[3] = {0, 0, 0}, largest = -1;
@@ -266,7 +266,8 @@ CUDA_CALLABLE inline void find_bounds(const Arrays& a, int i) {
 // Calls visit(j, taken) for partners j of moments i at x with radii ``size``. Partners of balls are permanent moments;
 // partners of ``permanent`` moments are balls. The mask ``taken`` has the lanes of i for which j is a partner.
 template <class Visit>
-CUDA_CALLABLE inline void for_each_partner(const Arrays& a, int i, Vector x, Number size, bool permanent, Visit visit) {
+CUDA_CALLABLE inline void for_each_partner(const NearArrays& a, int i, Vector x, Number size, bool permanent,
+                                           Visit visit) {
     int begin[WIDTH], end[WIDTH], first = a.balls, last = 0;
     for (int l = 0; l < WIDTH; ++l) {
         const bool selected = (a.group[i + l] < 0) == permanent;
@@ -294,7 +295,7 @@ CUDA_CALLABLE inline Vector scale_moment(Vector m, Number inverse_radius) {
 }
 
 // Pass 1: finds the response of balls.
-CUDA_CALLABLE inline void find_response(const Arrays& a, int i) {
+CUDA_CALLABLE inline void find_response(const NearArrays& a, int i) {
     const Magnet own = magnets(a, i);
     const Number zero = own.size * Real(0), size = own.size > zero ? own.size : zero + 1;
     const Number inverse_radius = 1 / size;
@@ -313,7 +314,7 @@ CUDA_CALLABLE inline void find_response(const Arrays& a, int i) {
 }
 
 // Force of the field of sources on the response of balls [μ0/4π R³].
-CUDA_CALLABLE inline Vector source_force(const Arrays& a, int i) {
+CUDA_CALLABLE inline Vector source_force(const NearArrays& a, int i) {
     const Real* const response = rows_at(a.response, RESPONSE_ROWS, i);
     const Real* const slopes = rows_at(a.expansion, EXPANSION_ROWS, i) + TENSOR_ROWS * CHUNK;
     const Number zero = Number(Real(0));
@@ -324,7 +325,7 @@ CUDA_CALLABLE inline Vector source_force(const Arrays& a, int i) {
 }
 
 // Pass 2: adds the forces on balls, opposite to their forces on permanent moments.
-CUDA_CALLABLE inline void add_ball_forces(const Arrays& a, int i) {
+CUDA_CALLABLE inline void add_ball_forces(const NearArrays& a, int i) {
     const Magnet own = magnets(a, i);
     const Number zero = own.size * Real(0), size = own.size > zero ? own.size : zero + 1;
     const Number inverse_radius = 1 / size;
@@ -345,7 +346,7 @@ CUDA_CALLABLE inline void add_ball_forces(const Arrays& a, int i) {
 }
 
 // Pass 3: adds the forces and torques on permanent moments.
-CUDA_CALLABLE inline void add_magnet_forces(const Arrays& a, int i) {
+CUDA_CALLABLE inline void add_magnet_forces(const NearArrays& a, int i) {
     const Magnet own = magnets(a, i);
     const Number zero = own.size * Real(0);
     Vector force = {zero, zero, zero}, torque = force;
@@ -370,7 +371,7 @@ CUDA_CALLABLE inline void add_magnet_forces(const Arrays& a, int i) {
 
 // The four passes above, once per evaluation of forces.
 struct NonuniformField {
-    const Arrays a;
+    const NearArrays a;
     CUDA_CALLABLE void operator()(int pass, int i) const {
         if (pass == 0) find_bounds(a, i);
         if (pass == 1) find_response(a, i);

@@ -92,8 +92,6 @@ def allocate(
         magnets: True for moments of permanent magnets, fixed or with a recoil permeability, shape [n].
         single: True for moments that are their body's only one, shape [n].
         movable: True for moments whose force is evaluated, shape [n].
-        dtype: Warp scalar type.
-        device: Warp device.
         expansion: Derivatives of the fields of sources, or None.
     """
     n = len(eligible)

@@ -26,7 +26,7 @@ CUDA_CALLABLE inline Fade window(Number gap, Real near, Real far, Real shallow, 
 
 // Writes positions, radii and kinds to lines, and raises a flag if a ball has moved so far that candidates are searched
 // again.
-CUDA_CALLABLE inline void store_position(const Arrays& a, int i) {
+CUDA_CALLABLE inline void store_position(const NearArrays& a, int i) {
     if (share() > 0) return;
     const size_t stride = a.moment_stride;
     const Real* row = a.packed + i;
@@ -43,7 +43,7 @@ CUDA_CALLABLE inline void store_position(const Arrays& a, int i) {
 }
 
 // Appends balls j, where ``chosen`` is 1, to the lists of balls i. ``filled`` counts them, also beyond ``slots``.
-CUDA_CALLABLE inline void append(const Arrays& a, int i, const int* j, Index chosen, int slots, int* filled) {
+CUDA_CALLABLE inline void append(const NearArrays& a, int i, const int* j, Index chosen, int slots, int* filled) {
 #if defined(__CUDA_ARCH__)
     const unsigned group = group_mask(), all = __ballot_sync(group, chosen) & group;
     const int s = *filled + __popc(all & ((1u << threadIdx.x % 32) - 1u));
@@ -60,7 +60,7 @@ CUDA_CALLABLE inline void append(const Arrays& a, int i, const int* j, Index cho
 }
 
 // Lists the near balls of balls i and writes their counts and weights. Balls with too many near balls have none.
-CUDA_CALLABLE inline void select(const Arrays& a, int i) {
+CUDA_CALLABLE inline void select(const NearArrays& a, int i) {
     int own[WIDTH], filled[WIDTH], touching[WIDTH], largest = 0;
     for (int l = 0; l < WIDTH; ++l) {
         own[l] = a.group[i + l] < 0 || a.candidate_count[i + l] > CANDIDATES ? 0 : a.candidate_count[i + l];
@@ -99,7 +99,7 @@ CUDA_CALLABLE inline void select(const Arrays& a, int i) {
 
 // Pass over all balls before candidates are searched.
 struct Positions {
-    const Arrays a;
+    const NearArrays a;
     CUDA_CALLABLE void operator()(int, int i) const { store_position(a, i); }
 };
 }

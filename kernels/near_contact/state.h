@@ -1,4 +1,4 @@
-// Arrays of the passes over near pairs, and cache lines that balls write for others to read.
+// NearArrays of the passes over near pairs, and cache lines that balls write for others to read.
 //
 // near_pairs.py documents the arrays. It passes the numbers of their rows and slots, and UNIT, μ0/4π [T·m/A].
 #pragma once
@@ -10,7 +10,7 @@
 namespace warpmag {
 
 // Data of ``contact_arrays`` in near_pairs.py, without shapes and strides.
-struct Arrays {
+struct NearArrays {
     int balls, moment_stride, kinds, common_curve;
     int *group, *field_row, *kind, *candidate, *candidate_count, *moved, *used, *counterpart, *movable, *rotatable,
         *near, *near_count, *contact_count, *curve, *partner_begin, *partner_end, *magnet_movable;
@@ -18,7 +18,7 @@ struct Arrays {
         *last_state, *sources, *drives, *field, *cached, *pair_slopes, *conductance_slopes, *pair_forces, *partial,
         *found_at, *tables, *positions, *forces, *torques, *curve_tables, *single, *response, *bounds, *expansion;
 
-    template <class Given> CUDA_CALLABLE explicit Arrays(const Given& a) {
+    template <class Given> CUDA_CALLABLE explicit NearArrays(const Given& a) {
         balls = a.balls, moment_stride = a.moment_stride, kinds = a.kinds, common_curve = a.common_curve;
         // moments
         packed = a.packed.data, group = a.group.data, field_row = a.field_row.data, kind = a.kind.data;
@@ -78,7 +78,7 @@ struct Drive {
 
 // Sources of balls j. A CPU reads m from the line of the ball. A GPU has no pass that writes it there, and reads the
 // packed moments.
-CUDA_CALLABLE inline Sources sources_at(const Arrays& arrays, const int* j) {
+CUDA_CALLABLE inline Sources sources_at(const NearArrays& arrays, const int* j) {
     const Four a = four_at(arrays.sources, 0, j), b = four_at(arrays.sources, 1, j), c = four_at(arrays.sources, 2, j);
 #if defined(__CUDA_ARCH__)
     const Vector m = arrays.own_moment(*j);
@@ -87,7 +87,7 @@ CUDA_CALLABLE inline Sources sources_at(const Arrays& arrays, const int* j) {
 #endif
     return {{m.x - b.y, m.y - b.z, m.z - b.w}, m, -c.x, {a.x, a.y, a.z, a.w, b.x}};
 }
-CUDA_CALLABLE inline Drive drive_at(const Arrays& arrays, const int* j) {
+CUDA_CALLABLE inline Drive drive_at(const NearArrays& arrays, const int* j) {
     const Four a = four_at(arrays.drives, 0, j), b = four_at(arrays.drives, 1, j), c = four_at(arrays.drives, 2, j);
     return {c.x, c.y, {b.y, b.z, b.w}, {a.x, a.y, a.z, a.w, b.x}};
 }
@@ -101,7 +101,7 @@ struct OwnIndices {
 
 // Slope k_d of the curve at the ball's moment, from 0 to 3 (an ideally permeable ball). The differential susceptibility
 // χ_d follows from 1/χ_d = 1/k_d − 1/3, so multipoles soften as a ball saturates.
-CUDA_CALLABLE inline Number differential_slope(const Arrays& a, int i) {
+CUDA_CALLABLE inline Number differential_slope(const NearArrays& a, int i) {
     const Number slope = numbers(a.curve_slope + i), zero = slope * Real(0);
     const Vector reduced = numbers(a.inverse_saturation + i) * a.own_moment(i);
     const Number steepness = curve_steepness(dot(reduced, reduced), a.curves(i));
@@ -142,7 +142,7 @@ CUDA_CALLABLE inline void store_line(Real* lines, int i, const Number* part, Vec
 template <class Passes, class Addresses>
 CUDA_CALLABLE inline void make_passes(int thread, int first, int last, int threads, unsigned long long* team,
                                       const Addresses& addresses) {
-    const Passes passes = {Arrays(addresses)};
+    const Passes passes = {NearArrays(addresses)};
 #if defined(__CUDA_ARCH__)
     passes(first, thread / GROUP);
 #else

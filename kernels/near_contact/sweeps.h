@@ -12,10 +12,10 @@ constexpr unsigned DRIVES = 0x20ff,
                    DRIVES_AND_FIELD = 0xe1ff; // bits of the numbers of a drive; and 8, 14, 15 for (M_sr a)_m
 
 // Polarizability p of a ball's quadrupole, and p relative to its value in a small field.
-struct Softness {
+struct QuadrupoleResponse {
     Number p, weight;
 };
-CUDA_CALLABLE inline Softness softness_of(const Arrays& a, int i) {
+CUDA_CALLABLE inline QuadrupoleResponse quadrupole_response(const NearArrays& a, int i) {
     const Number p = polarizability(differential_slope(a, i), 2);
     return {p, p * numbers(a.hardness + i)};
 }
@@ -58,7 +58,7 @@ CUDA_CALLABLE inline void add_dipole_field(Number (&sum)[16], const Rows<PAIR_RO
 // Sums e = M ã over near balls, contacts last. The first sweep of an evaluation caches the sum over the other near
 // balls, and the field of the moments. The following sweeps only add contacts.
 template <bool FIRST>
-CUDA_CALLABLE inline void sum_drive(const Arrays& a, int i, Number (&sum)[16], const Parts<CACHED_ROWS>& cached) {
+CUDA_CALLABLE inline void sum_drive(const NearArrays& a, int i, Number (&sum)[16], const Parts<CACHED_ROWS>& cached) {
     Partners<NEAR_SLOTS> partners(a.near, i);
     const int contact_end = whole_rounds(largest_count(a.contact_count + i));
     const int end = FIRST ? whole_rounds(largest_count(a.near_count + i)) : contact_end;
@@ -95,19 +95,20 @@ CUDA_CALLABLE inline void sum_drive(const Arrays& a, int i, Number (&sum)[16], c
 
 // Writes the drive and the target of the quadrupoles, Θ̃ = −p R⁵ e' − (1 − p) n_Θ. Returns 4π H_near = (M_sr a − e)_m,
 // or 0 in the first sweep.
-template <bool FIRST> CUDA_CALLABLE inline Vector find_drive(const Arrays& a, int i) {
+template <bool FIRST> CUDA_CALLABLE inline Vector find_drive(const NearArrays& a, int i) {
     Real* const rows = rows_at(a.cached, CACHED_ROWS, i);
     const Parts<CACHED_ROWS> cached(rows);
     const Parts<STATE_ROWS> state(rows_at(a.state, STATE_ROWS, i));
     const Number size = numbers(a.radius + i), zero = size * Real(0);
-    const Softness soft = FIRST ? softness_of(a, i) : Softness{number(cached, 17), number(cached, 18)};
+    const QuadrupoleResponse response =
+        FIRST ? quadrupole_response(a, i) : QuadrupoleResponse{number(cached, 17), number(cached, 18)};
     Number sum[16], drive[parts(16)], difference[parts(16)], m[parts(8)];
     for (int k = 0; k < parts(8); ++k) {
         const int component = k * SHARES + share() - 5;
         m[k] = component < 0 ? zero : numbers(a.moment(component < 0 ? 0 : component, i));
     }
     sum_drive<FIRST>(a, i, sum, cached);
-    const Number p = soft.p, square = size * size, inverse = 1 / size, cube = inverse * inverse * inverse;
+    const Number p = response.p, square = size * size, inverse = 1 / size, cube = inverse * inverse * inverse;
     const Number source = OWN_SOURCE * inverse, dipole = OWN_DIPOLE * cube, fifth = cube * inverse * inverse;
 #pragma unroll
     for (int k = 0; k < parts(14); ++k) {
@@ -123,10 +124,10 @@ template <bool FIRST> CUDA_CALLABLE inline Vector find_drive(const Arrays& a, in
         drive[k] = quadrupole ? square * (1 - p) * difference[k] : size * (difference[k] + dipole * m[k]);
         if (quadrupole) put(rows + (c + 8) * CHUNK, (p - 1) * own - p * square * square * size * other);
     }
-    store_line(a.drives, i, drive, {soft.weight, zero, zero});
+    store_line(a.drives, i, drive, {response.weight, zero, zero});
     if (FIRST && share() == 0) {
-        put(rows + 17 * CHUNK, soft.p);
-        put(rows + 18 * CHUNK, soft.weight);
+        put(rows + 17 * CHUNK, response.p);
+        put(rows + 18 * CHUNK, response.weight);
     }
     if (FIRST) return {zero, zero, zero};
     const Vector dipoles = {number(cached, 16), number(cached, 22), number(cached, 23)};
@@ -144,13 +145,13 @@ CUDA_CALLABLE inline ContactDrive at_contact(const Drive& o, Vector u, int sign)
 }
 typedef Rows<CONDUCTANCE_ROWS> Conductances;
 // D', J' or L' of the other ball, for row 3, 9 or 11. With one kind of material they equal D, J and L.
-CUDA_CALLABLE inline Number other_conductance(const Arrays& a, const Conductances& f, int row) {
+CUDA_CALLABLE inline Number other_conductance(const NearArrays& a, const Conductances& f, int row) {
     return a.kinds > 1 ? f[row == 3 ? 14 : row == 9 ? 15 : 16] : f[row];
 }
 
 // Adds the sources ΔC e of a contact of a ball of radius ``size``, from the drives of both balls.
-CUDA_CALLABLE inline void add_contact_sources(const Arrays& arrays, Number (&sum)[16], const Conductances& f, Vector u,
-                                              Number size, const Drive& own, const Drive& other) {
+CUDA_CALLABLE inline void add_contact_sources(const NearArrays& arrays, Number (&sum)[16], const Conductances& f,
+                                              Vector u, Number size, const Drive& own, const Drive& other) {
     const Number w = own.weight * other.weight;
     const ContactDrive a = at_contact(own, u, 1), b = at_contact(other, u, -1);
     sum[13] += w * (f[0] * a.phi + f[1] * b.phi + f[2] * a.alpha + f[3] * b.alpha + f[8] * a.gamma + f[9] * b.gamma);
@@ -175,7 +176,7 @@ CUDA_CALLABLE inline void add_contact_sources(const Arrays& arrays, Number (&sum
 
 // Moves contact sources towards ΔC e, and quadrupoles towards their target, by a heavy-ball step:
 // n ← n + α s (ΔC e − n) + β (n − n').
-CUDA_CALLABLE inline void relax(const Arrays& a, int i) {
+CUDA_CALLABLE inline void relax(const NearArrays& a, int i) {
     Partners<CONTACT_SLOTS> partners(a.near, i);
     Real *const rows = rows_at(a.state, STATE_ROWS, i), *const last_rows = rows_at(a.last_state, STATE_ROWS, i);
     const Parts<STATE_ROWS> state(rows), last(last_rows);
@@ -210,14 +211,14 @@ CUDA_CALLABLE inline void relax(const Arrays& a, int i) {
 }
 
 // Writes moments to the lines of sources.
-CUDA_CALLABLE inline void store_moment(const Arrays& a, int i) {
+CUDA_CALLABLE inline void store_moment(const NearArrays& a, int i) {
     const Vector m = a.own_moment(i);
     put_four(a.sources, 2, i, {numbers(rows_at(a.state, STATE_ROWS, i) + 13 * CHUNK), m.x, m.y, m.z});
 }
 
 // Pass 0 writes moments on a CPU; then each sweep is a pass for the drive and one for the step. Returns 4π H_near after
 // the last drive.
-CUDA_CALLABLE inline Vector sweep_pass(const Arrays& a, int pass, int i) {
+CUDA_CALLABLE inline Vector sweep_pass(const NearArrays& a, int pass, int i) {
     if (pass == 1) return find_drive<true>(a, i);
     if (pass % 2 == 1) return find_drive<false>(a, i);
     if (pass > 0) relax(a, i);
@@ -228,7 +229,7 @@ CUDA_CALLABLE inline Vector sweep_pass(const Arrays& a, int pass, int i) {
 
 // Sweeps of a field evaluation. The pass of the last drive writes 4π H_near to the partial sums of the field.
 struct Sweeps {
-    const Arrays a;
+    const NearArrays a;
     CUDA_CALLABLE void operator()(int pass, int i) const {
         const Vector h = sweep_pass(a, pass, i);
         if (pass != 2 * SWEEPS - 1 || share() > 0) return;

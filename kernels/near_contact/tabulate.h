@@ -29,7 +29,7 @@ CUDA_CALLABLE inline Potential potential(Number d, Number a, Number b, Number ap
 }
 
 // Writes the rows of slot s of ball i, a pair in direction u; zeros in lanes without a pair.
-CUDA_CALLABLE inline void tabulate_pair(const Arrays& arrays, int i, int s, Vector u, const NearPair& p) {
+CUDA_CALLABLE inline void tabulate_pair(const NearArrays& arrays, int i, int s, Vector u, const NearPair& p) {
     const Number a = p.a, b = p.b, unit = p.unit, zero = a * Real(0);
     Real *const rows = arrays.pair(s, i), *const slopes = arrays.pair_slope(s, i);
     auto keep = [=](int row, Number n) { put(rows + row * CHUNK, p.live ? n : zero); };
@@ -91,7 +91,7 @@ CUDA_CALLABLE inline void interpolate(const Real* tables, int quarter, const int
 }
 
 // Writes the conductances of slot s of ball i and their derivatives. Adds the ball's self-conductances to two sums.
-CUDA_CALLABLE inline void tabulate_contact(const Arrays& arrays, int i, int s, const NearPair& p, Number both,
+CUDA_CALLABLE inline void tabulate_contact(const NearArrays& arrays, int i, int s, const NearPair& p, Number both,
                                            Index kind, Index other_kind, Number& sources, Number& dipoles) {
     const Number zero = p.a * Real(0), scale = 2 * p.a * p.b * p.unit;
     const auto touches = both > zero;
@@ -130,7 +130,7 @@ CUDA_CALLABLE inline void tabulate_contact(const Arrays& arrays, int i, int s, c
 
 // Finds the index of the other ball's part of a contact's force. If there is none, it is the index of the last entries,
 // which are zero.
-CUDA_CALLABLE inline void find_counterpart(const Arrays& a, int i, int s, int j) {
+CUDA_CALLABLE inline void find_counterpart(const NearArrays& a, int i, int s, int j) {
     int place = -1;
     auto takes_part = [&](int ball) { return a.positions[LINE * (size_t)ball + 4] > 0; };
     if (s < a.contact_count[i] && takes_part(i) && takes_part(j))
@@ -141,7 +141,7 @@ CUDA_CALLABLE inline void find_counterpart(const Arrays& a, int i, int s, int j)
 }
 
 // Sets the state of balls without near balls to zero, so that they start cold when they have one again.
-CUDA_CALLABLE inline void reset_isolated(const Arrays& a, int i, Mask isolated) {
+CUDA_CALLABLE inline void reset_isolated(const NearArrays& a, int i, Mask isolated) {
     if (!any(isolated)) return;
     const Number zero = numbers(a.radius + i) * Real(0);
     for (int quarter = 0; quarter < 3; ++quarter) {
@@ -156,7 +156,7 @@ CUDA_CALLABLE inline void reset_isolated(const Arrays& a, int i, Mask isolated) 
 }
 
 // Tabulates the slots of a ball. Slots that are no longer used are emptied: they hold the ball itself, and zeros.
-CUDA_CALLABLE inline void tabulate(const Arrays& a, int i) {
+CUDA_CALLABLE inline void tabulate(const NearArrays& a, int i) {
     int *const used = a.used + i, *const used_contacts = used + a.balls;
     const int contact_slots = largest_count(a.contact_count + i), counted = largest_count(a.near_count + i),
               emptied = largest_count(used);
@@ -200,7 +200,7 @@ CUDA_CALLABLE inline void tabulate(const Arrays& a, int i) {
 
 // Two passes: select near balls, then tabulate them.
 struct Pairs {
-    const Arrays a;
+    const NearArrays a;
     CUDA_CALLABLE void operator()(int pass, int i) const {
         if (pass == 0) select(a, i);
         else tabulate(a, i);

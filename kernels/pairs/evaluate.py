@@ -40,7 +40,7 @@ from warpmag.kernels.pairs.work_list import (
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
-from warpmag.kernels.shared.team import team, threads_for
+from warpmag.kernels.shared.team import launch_passes, threads_for
 
 LOOP, FUSED, MIRRORED, REFERENCE, GIVEN = "loop", "fused", "mirrored", "reference", "given"
 
@@ -66,14 +66,12 @@ class PairEvaluation:
             where e is the moment itself.
         segments: Integers [k, 4]: targets begin and end, sources begin and end, as packed columns.
         targets: Packed targets with their overlapping sources (``packing.PackedMoments``), t of them.
-        sources: Packed sources.
         base: Base field [A/m], which also exerts torques, shape [t].
         out: Out, field [A/m] or forces [N] at the targets of ``segments``, shape [t]. The form ``MIRRORED`` also writes
             other sources' elements.
         effective: Effective moments e [A·m²], shape [3, t]; None means the moments.
         with_torque: Nonzero where a torque is computed, shape [t].
         torques: Out, torques [N·m], shape [t].
-        extra_parts: Number of partial sums that the caller writes.
         smoothing: Length ℓ [m] of the paper's smoothing, with the form ``REFERENCE``.
         form: Form of the sums; None means the fastest.
         sums: Function (effective moments, packed columns of the target rows, partial sums out) that launches the sums,
@@ -174,13 +172,8 @@ class PairEvaluation:
         """Launch a pass over the target rows. The launch is recorded, so that the struct is packed only once."""
         if kernel not in self._recorded:
             device = self.partial.device
-            self._recorded[kernel] = wp.launch(
-                kernel,
-                dim=group_threads(device) * self.count if device.is_cuda else 1,
-                inputs=[0, 1, threads, None if device.is_cuda else team(), self._arrays],
-                device=device,
-                record_cmd=True,
-            )
+            sizes = dict(threads=threads, gpu_threads=group_threads(device) * self.count)
+            self._recorded[kernel] = launch_passes(kernel, 0, 1, self._arrays, device=device, record_cmd=True, **sizes)
         self._recorded[kernel].launch()
 
 
@@ -219,7 +212,7 @@ def _cpu_loop_kernel(dtype, quantity: Quantity):
 
 @cache
 def _fused_kernel(dtype, quantity: Quantity, shape):
-    numbers = f"{shape.held}, {shape.lanes}, {shape.warps}, {shape.unrolled}"
+    numbers = f"{shape.targets_per_lane}, {shape.lanes}, {shape.warps}, {shape.unrolled}"
     return native_kernel(
         f"sum_and_finish<warpmag::Quantity({quantity:d}), {numbers}>(arrays)",
         "pairs/fused_finish_cuda.h",
@@ -232,10 +225,6 @@ def _fused_kernel(dtype, quantity: Quantity, shape):
 
 
 def _launch_fused(quantity: Quantity, shape, arrays):
-    wp.launch(
-        _fused_kernel(arrays.targets.dtype, quantity, shape),
-        dim=arrays.tiles.shape[0] * shape.threads,
-        inputs=[arrays],
-        device=arrays.targets.device,
-        block_dim=shape.threads,
-    )
+    kernel, blocks = _fused_kernel(arrays.targets.dtype, quantity, shape), arrays.tiles.shape[0]
+    threads, device = shape.threads, arrays.targets.device
+    wp.launch(kernel, dim=blocks * threads, inputs=[arrays], device=device, block_dim=threads)

@@ -12,9 +12,9 @@
 
 namespace warpmag {
 
-// Target rows: row numbers, packed columns i and ranges of sources. Only the first ``held`` lanes are stored.
+// Target rows: row numbers, packed columns i and ranges of sources. Only the first ``lane_count`` lanes are stored.
 struct TargetRows {
-    int first, held;
+    int first, lane_count;
     Index row, i, begin, end;
 };
 
@@ -41,29 +41,29 @@ template <class Arrays> CUDA_CALLABLE inline TargetRows target_rows(const Arrays
     return {row, share() == 0, row, arrays.target.data[row], arrays.begin.data[row], arrays.end.data[row]};
 }
 CUDA_CALLABLE inline void put_vectors_at(Real* vectors, const TargetRows& at, Vector v) {
-    if (at.held > 0) put_vectors(vectors + 3 * (size_t)at.i, 1, v);
+    if (at.lane_count > 0) put_vectors(vectors + 3 * (size_t)at.i, 1, v);
 }
 CUDA_CALLABLE inline Mask nonzero_at(const int* values, const TargetRows& at) { return values[at.i] != 0; }
 #else
 template <class Arrays> inline TargetRows target_rows(const Arrays& arrays, int first) {
     const int *target = arrays.target.data, *begin = arrays.begin.data, *end = arrays.end.data;
-    const int left = arrays.target.shape[0] - first, held = left < WIDTH ? left : WIDTH;
-    TargetRows at = {first, held, first, target[first], begin[first], begin[first]};
-    for (int l = 0; l < held; ++l) {
+    const int left = arrays.target.shape[0] - first, lane_count = left < WIDTH ? left : WIDTH;
+    TargetRows at = {first, lane_count, first, target[first], begin[first], begin[first]};
+    for (int l = 0; l < lane_count; ++l) {
         at.row[l] = first + l;
         at.i[l] = target[first + l], at.begin[l] = begin[first + l], at.end[l] = end[first + l];
     }
     return at;
 }
 inline void put_vectors_at(Real* vectors, const TargetRows& at, Vector v) {
-    for (int l = 0; l < at.held; ++l) {
+    for (int l = 0; l < at.lane_count; ++l) {
         Real* const own = vectors + 3 * (size_t)at.i[l];
         own[0] = v.x[l], own[1] = v.y[l], own[2] = v.z[l];
     }
 }
 inline Mask nonzero_at(const int* values, const TargetRows& at) {
     Index value = 0;
-    for (int l = 0; l < at.held; ++l) value[l] = values[at.i[l]];
+    for (int l = 0; l < at.lane_count; ++l) value[l] = values[at.i[l]];
     return mask_of(value != 0);
 }
 #endif
@@ -77,7 +77,7 @@ CUDA_CALLABLE inline Vector added_parts(const Arrays& arrays, const TargetRows& 
     for (int part = share(); part < arrays.partial.shape[0]; part += SHARES) {
         const Real* const sums = arrays.partial.data + (size_t)part * arrays.partial.shape[1] * ROW + offset;
         if constexpr (ROW == 3 && WIDTH > 1) {
-            total += vectors(sums + 3 * (size_t)at.first, at.held);
+            total += vectors(sums + 3 * (size_t)at.first, at.lane_count);
         } else {
             const Index place = ROW * at.row;
             total += Vector{collect(sums, place), collect(sums + 1, place), collect(sums + 2, place)};
@@ -105,7 +105,7 @@ CUDA_CALLABLE inline void add_overlaps(Vector& h, Vector& f, Vector e, const Arr
         if (Q != Quantity::FIELD) add_where(active, f, force_of(pair(), e));
         if (Q == Quantity::FIELD || Q == Quantity::WRENCH) add_where(active, h, field_of(pair()));
     };
-    walk_lists(arrays.overlap.data, arrays.overlap_count.data, at.i, at.held, at.begin, at.end, add);
+    walk_lists(arrays.overlap.data, arrays.overlap_count.data, at.i, at.lane_count, at.begin, at.end, add);
 }
 
 // Stores the field H = base + h/4π [A/m], or the force μ0 f/4π [N] and torque μ0 e × H [N·m].

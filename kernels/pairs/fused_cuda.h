@@ -41,12 +41,12 @@ CUDA_CALLABLE inline void fold(Real (&r)[SIZE], int lane, Real* out, bool writes
 }
 
 // Sums over a warp's share of the sources of a tile, written to ``staging``. Lane l has targets l, l + LANES, ...
-template <Quantity Q, int HELD, int LANES, int UNROLLED>
+template <Quantity Q, int TARGETS, int LANES, int UNROLLED>
 CUDA_CALLABLE inline void sum_share(int lane, const TileEntry& tile, int source_begin, int source_end,
                                     const Table& target_rows, const Table& sources, const Table& effective_rows,
                                     Quad* staging) {
     constexpr bool FIELD = Q == Quantity::FIELD;
-    constexpr int VALUES = padded(HELD * width(Q), LANES);
+    constexpr int VALUES = padded(TARGETS * width(Q), LANES);
     const int column_begin = tile.column_begin, count = tile.row_end - tile.row_begin, own = lane % LANES;
     const bool same = sources.data == target_rows.data;
     // lanes beyond the last target read other moments, and are not written. Their labels, which mask, and effective
@@ -57,33 +57,33 @@ CUDA_CALLABLE inline void sum_share(int lane, const TileEntry& tile, int source_
         if constexpr (FIELD) return {t.x, t.radius};
         else return {t.x, t.radius, target_rows(7, column), effective_rows.vector(0, column)};
     };
-    LaneTargets<Q, HELD> held;
-    add_sources<LANES, UNROLLED, false>(held, target_at, sources, source_begin, source_end,
+    LaneTargets<Q, TARGETS> lane_targets;
+    add_sources<LANES, UNROLLED, false>(lane_targets, target_at, sources, source_begin, source_end,
                                         sources(3, tile.source_begin), same ? column_begin : FAR, same ? count : 0,
                                         lane, staging);
     Real r[VALUES] = {};
 #pragma unroll
-    for (int k = 0; k < HELD; ++k) results<Q>(held.sums[k], held.targets[k].e, r + k * width(Q));
+    for (int k = 0; k < TARGETS; ++k) results<Q>(lane_targets.sums[k], lane_targets.targets[k].e, r + k * width(Q));
     fold<LANES, VALUES>(r, lane, (Real*)staging + own * VALUES);
 }
 
 // Total of target `thread` of a tile, in the threads that have a target: sums over pairs plus a correction. SHARES
 // threads compute the correction as the vector correct(column, share), for the packed column of the target.
-template <Quantity Q, int HELD, int LANES, int WARPS, int UNROLLED, int SHARES, class Correct>
+template <Quantity Q, int TARGETS, int LANES, int WARPS, int UNROLLED, int SHARES, class Correct>
 CUDA_CALLABLE inline wp::vec_t<width(Q), Real>
 sum_fused(int block, int thread, const wp::array_t<int>& tiles, const wp::array_t<Real>& target_table,
           const wp::array_t<Real>& source_table, const wp::array_t<Real>& effective_table, Correct correct) {
-    constexpr int WIDTH = width(Q), VALUES = padded(HELD * WIDTH, LANES);
+    constexpr int WIDTH = width(Q), VALUES = padded(TARGETS * WIDTH, LANES);
     // per warp: staged sources, at the end its sums
     __shared__ Quad staging[WARPS][LANES * VALUES > 320 ? LANES * VALUES / 4 : 80];
-    __shared__ Real corrections[HELD * LANES][WIDTH];
+    __shared__ Real corrections[TARGETS * LANES][WIDTH];
     const TileEntry& tile = ((const TileEntry*)tiles.data)[block];
     const int count = tile.row_end - tile.row_begin;
     if (thread < 32 * WARPS) {
         const int warp = thread / 32, range = tile.source_end - tile.source_begin;
-        sum_share<Q, HELD, LANES, UNROLLED>(thread % 32, tile, tile.source_begin + range * warp / WARPS,
-                                            tile.source_begin + range * (warp + 1) / WARPS, Table(target_table),
-                                            Table(source_table), Table(effective_table), staging[warp]);
+        sum_share<Q, TARGETS, LANES, UNROLLED>(thread % 32, tile, tile.source_begin + range * warp / WARPS,
+                                               tile.source_begin + range * (warp + 1) / WARPS, Table(target_table),
+                                               Table(source_table), Table(effective_table), staging[warp]);
     } else {
         const int k = (thread - 32 * WARPS) / SHARES, share = thread % SHARES;
         wp::vec_t<WIDTH, Real> correction;
@@ -93,7 +93,7 @@ sum_fused(int block, int thread, const wp::array_t<int>& tiles, const wp::array_
             Real total = correction[c];
 #pragma unroll
             for (int step = SHARES / 2; step > 0; step /= 2) total += __shfl_xor_sync(ALL_LANES, total, step);
-            if (share == 0 && k < HELD * LANES) corrections[k][c] = total;
+            if (share == 0 && k < TARGETS * LANES) corrections[k][c] = total;
         }
     }
     __syncthreads();

@@ -8,24 +8,17 @@ from warpmag.kernels.pairs.pair_law import Quantity
 
 @dataclass(frozen=True)
 class FusedShape:
-    """Shape of the blocks.
+    """Shape of the blocks."""
 
-    Attributes:
-        held: Targets per lane.
-        lanes: Lanes of a warp that hold different targets.
-        warps: Warps of a block, which share the sources.
-        unrolled: Sources per unrolled step of the loop.
-    """
-
-    held: int
-    lanes: int
-    warps: int
-    unrolled: int
+    targets_per_lane: int  # targets per lane
+    lanes: int  # lanes of a warp that hold different targets
+    warps: int  # Warps of a block, which share the sources
+    unrolled: int  # sources per unrolled step of the loop
 
     @property
     def targets(self) -> int:
         """Targets per block."""
-        return self.held * self.lanes
+        return self.targets_per_lane * self.lanes
 
     @property
     def summing(self) -> int:

@@ -6,7 +6,7 @@
 
 namespace warpmag {
 
-template <Quantity Q, int HELD, int LANES, int WARPS, int UNROLLED, class Arrays>
+template <Quantity Q, int TARGETS, int LANES, int WARPS, int UNROLLED, class Arrays>
 CUDA_CALLABLE inline void sum_and_finish(const Arrays& arrays) {
     // not Warp's thread index, whose division would delay everything that follows
     const int block = blockIdx.x, thread = threadIdx.x;
@@ -28,8 +28,8 @@ CUDA_CALLABLE inline void sum_and_finish(const Arrays& arrays) {
         if constexpr (Q == Quantity::WRENCH) correction[3] = h.x, correction[4] = h.y, correction[5] = h.z;
         return correction;
     };
-    const auto total = sum_fused<Q, HELD, LANES, WARPS, UNROLLED, GROUP>(block, thread, arrays.tiles, arrays.targets,
-                                                                         arrays.sources, arrays.effective, correct);
+    const auto total = sum_fused<Q, TARGETS, LANES, WARPS, UNROLLED, GROUP>(block, thread, arrays.tiles, arrays.targets,
+                                                                            arrays.sources, arrays.effective, correct);
     if (!has_target) return;
     constexpr int H = Q == Quantity::WRENCH ? 3 : 0;
     const Vector first = {total[0], total[1], total[2]}, last = {total[H], total[H + 1], total[H + 2]};

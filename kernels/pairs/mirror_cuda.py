@@ -18,19 +18,12 @@ from warpmag.kernels.shared.native import native_kernel
 
 @dataclass(frozen=True)
 class MirrorShape:
-    """Shape of the blocks.
+    """Shape of the blocks."""
 
-    Attributes:
-        moments: Moments per lane; a tile has at most 32 times as many.
-        warps: Warps per block.
-        blocks: Resident blocks per multiprocessor, in float32.
-        unrolled: Steps of a stage that are unrolled.
-    """
-
-    moments: int
-    warps: int
-    blocks: int
-    unrolled: int
+    moments: int  # moments per lane; a tile has at most 32 times as many
+    warps: int  # Warps per block
+    blocks: int  # resident blocks per multiprocessor, in float32
+    unrolled: int  # steps of a stage that are unrolled
 
 
 # Measured on an H200 at 5,000 to 131,072 moments: most moments for which a shape is fastest, and the shape.
@@ -68,23 +61,15 @@ class MirrorTiles:
 
 @dataclass(frozen=True)
 class Mirror:
-    """Work list of moments among themselves, on one device.
+    """Work list of moments among themselves, on one device."""
 
-    Attributes:
-        quantity: ``FIELD`` or ``MUTUAL_FORCE``.
-        shape: Shape of the blocks.
-        tiles: Tiles and blocks.
-        passes: First block, number of blocks, and first distance between tiles of each launch.
-        slabs: Number of slabs; partial sums of the blocks' shares follow them.
-        splits: Number of blocks of a pass that share the walk of a home tile.
-    """
-
-    quantity: Quantity
-    shape: MirrorShape
-    tiles: MirrorTiles
+    quantity: Quantity  # ``FIELD`` or ``MUTUAL_FORCE``
+    shape: MirrorShape  # shape of the blocks
+    tiles: MirrorTiles  # tiles and blocks
+    # First block, number of blocks, and first distance between tiles of each launch.
     passes: tuple[tuple[int, int, int], ...]
-    slabs: int
-    splits: int
+    slabs: int  # number of slabs; partial sums of the blocks' shares follow them
+    splits: int  # number of blocks of a pass that share the walk of a home tile
 
 
 def make_mirror(origin: int, count: int, quantity: Quantity, dtype, device, ranks=None) -> Mirror:
@@ -139,16 +124,12 @@ def _choose_splits(shape: MirrorShape, tiles: int, walk: int, multiprocessors: i
 def _kernel(dtype, quantity: Quantity, shape: MirrorShape):
     bounds = 32 * shape.warps, shape.blocks if dtype is wp.float32 else 1
     numbers = f"{shape.moments}, {shape.warps}, {shape.unrolled}"
+    arguments = {"packed": wp.array2d[dtype], "tiles": MirrorTiles, "first_block": int, "nearest": int}
     return native_kernel(
         f"sum_mirrored<warpmag::Quantity({quantity:d}), {numbers}>"
         "(first_block + blockIdx.x, threadIdx.x, packed, tiles, nearest, partial_out)",
         "pairs/mirror_cuda.h",
-        {
-            "packed": wp.array2d[dtype],
-            "tiles": MirrorTiles,
-            **dict.fromkeys(("first_block", "nearest"), int),
-            "partial_out": wp.array3d[dtype],
-        },
+        arguments | {"partial_out": wp.array3d[dtype]},
         dtype=dtype,
         launch={"grid_stride": False, "launch_bounds": bounds},
     )
@@ -157,12 +138,7 @@ def _kernel(dtype, quantity: Quantity, shape: MirrorShape):
 def launch_pair_loop_mirrored(m: Mirror, packed, partial):
     """Sum a quantity over all pairs; see ``evaluate``."""
     block = 32 * m.shape.warps
+    kernel, device = _kernel(partial.dtype, m.quantity, m.shape), partial.device
     for first_block, blocks, nearest in m.passes:
-        wp.launch(
-            _kernel(partial.dtype, m.quantity, m.shape),
-            dim=block * blocks,
-            inputs=[packed, m.tiles, first_block, nearest],
-            outputs=[partial],
-            block_dim=block,
-            device=partial.device,
-        )
+        inputs = [packed, m.tiles, first_block, nearest]
+        wp.launch(kernel, block * blocks, inputs=inputs, outputs=[partial], block_dim=block, device=device)

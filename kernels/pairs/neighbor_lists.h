@@ -21,11 +21,12 @@ CUDA_CALLABLE inline void walk_lists(const int* lists, const int* counts, int i,
 }
 #else
 template <class Visit>
-inline void walk_lists(const int* lists, const int* counts, Index i, int held, Index begin, Index end, Visit visit) {
+inline void walk_lists(const int* lists, const int* counts, Index i, int lane_count, Index begin, Index end,
+                       Visit visit) {
     Index own = i[0], first = 0, count = 0, full = 0;
     // length of the longest list, and range of sources of the balls whose list is full
     int longest = 0, lowest = __INT_MAX__, highest = 0;
-    for (int l = 0; l < held; ++l) {
+    for (int l = 0; l < lane_count; ++l) {
         if (end[l] <= begin[l]) continue;
         own[l] = i[l], first[l] = begin[l];
         full[l] = counts[i[l]] > CAPACITY;
@@ -48,10 +49,11 @@ inline void walk_lists(const int* lists, const int* counts, Index i, int held, I
 }
 #endif
 
-// Shared volumes Σ_j |B_i ∩ B_j|/√(V_i V_j) of ``held`` moments from i on, over sources j from begin to end that
+// Shared volumes Σ_j |B_i ∩ B_j|/√(V_i V_j) of ``lane_count`` moments from i on, over sources j from begin to end that
 // accepts(i, j) selects. ``lists`` has the packed moments and the overlap lists.
 template <class Lists, class Accepts>
-CUDA_CALLABLE inline Number shared_volumes(const Lists& lists, int i, int held, int begin, int end, Accepts accepts) {
+CUDA_CALLABLE inline Number shared_volumes(const Lists& lists, int i, int lane_count, int begin, int end,
+                                           Accepts accepts) {
     const Real* const packed = (const Real*)lists.packed.data;
     const size_t pitch = lists.packed.strides[0] / sizeof(Real);
     Index self = Index(i);
@@ -66,7 +68,7 @@ CUDA_CALLABLE inline Number shared_volumes(const Lists& lists, int i, int held, 
         const Vector r = {x.x - row(0, j), x.y - row(1, j), x.z - row(2, j)};
         volume += shared_volume(dot(r, r), radius, row(3, j), listed & accepts(self, j));
     };
-    walk_lists(lists.overlap.data, lists.overlap_count.data, self, held, Index(begin), Index(end), add);
+    walk_lists(lists.overlap.data, lists.overlap_count.data, self, lane_count, Index(begin), Index(end), add);
     return group_sum(volume);
 }
 }

@@ -71,8 +71,6 @@ def allocate(count: int, packed, group, *, reach: float, ratio=1.0 + SKIN, capac
     """Allocate empty lists; return the struct :func:`lists_type`.
 
     Args:
-        count: Number of moments n.
-        packed: Packed moments, shape [8, n].
         group: Group of each moment, shape [n] or longer: only moments of one group are neighbors, none if negative.
         reach: Largest contact distance [m].
         ratio: Largest distance of neighbors over their contact distance; 1 lists overlapping pairs only.
@@ -101,7 +99,7 @@ def allocate(count: int, packed, group, *, reach: float, ratio=1.0 + SKIN, capac
     return lists
 
 
-def carried_lists(lists) -> dict:
+def persistent_lists(lists) -> dict:
     """Return the arrays that a search reads from the previous search, by name."""
     return {name: getattr(lists, name) for name in ("neighbor", "count", "found_at", "moved", "searching")}
 
@@ -120,13 +118,8 @@ def _launch(call: str, targets, sources, dim: int = 1):
     if device.is_cpu:
         header, members = "pairs/neighbors_cpu.h", team()
         threads = threads_for(targets.packed.shape[1], MOMENTS_PER_THREAD)
-    wp.launch(
-        _kernel(call, header, targets.packed.dtype, targets.neighbor.shape[1], group_threads(device)),
-        dim=dim,
-        inputs=[threads, members, targets, sources],
-        device=device,
-        block_dim=_BLOCK,
-    )
+    kernel = _kernel(call, header, targets.packed.dtype, targets.neighbor.shape[1], group_threads(device))
+    wp.launch(kernel, dim=dim, inputs=[threads, members, targets, sources], device=device, block_dim=_BLOCK)
 
 
 def launch_find_neighbors(targets, sources):
@@ -139,11 +132,8 @@ def launch_find_neighbors(targets, sources):
     if targets.packed.device.is_cpu:
         _launch("search_neighbors(targets, sources, threads, team.data)", targets, sources)
         return
-    for call, dim in (
-        ("fill_table", max(sources.packed.shape[1], 1)),
-        ("list_neighbors", 32 * targets.packed.shape[1]),
-    ):
-        _launch(f"{call}(thread, targets, sources)", targets, sources, dim)
+    _launch("fill_table(thread, targets, sources)", targets, sources, max(sources.packed.shape[1], 1))
+    _launch("list_neighbors(thread, targets, sources)", targets, sources, 32 * targets.packed.shape[1])
 
 
 def launch_list_overlaps(targets, sources):

@@ -42,13 +42,11 @@ def _pack_kernel(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def pack(
-        # inputs:
         positions: wp.array[vec3],
         moments: wp.array[vec3],
         radii: wp.array[dtype],
         labels: wp.array[int],
         found_at: wp.array[vec3],
-        # outputs:
         packed_out: wp.array2d[dtype],
         moved_out: wp.array[int],
     ):
@@ -87,19 +85,14 @@ class PackedMoments:
 
         Args:
             radii: Ball radii [m], Warp array, shape [n].
-            largest_radius: Largest radius [m].
             labels: Body label of each moment, exact in float32 up to 2²⁴, shape [n]; None means one body each.
             groups: World of each moment, shape [n]; None means one world.
             moving: True if the moments move by small steps, for which neighbor lists with a skin are faster. Otherwise
                 the lists are rebuilt each time.
         """
         device, dtype, n = radii.device, radii.dtype, radii.shape[0]
-        self.count = n
-        self.device = device
-        self.dtype = dtype
-        self.radii = radii
-        self.largest_radius = largest_radius
-        self._moving = moving
+        self.count, self.device, self.dtype = n, device, dtype
+        self.radii, self.largest_radius, self._moving = radii, largest_radius, moving
 
         def integers(values):
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=device)
@@ -125,21 +118,16 @@ class PackedMoments:
         """Allocate rows with the layout of :attr:`moments`, zero, shape [rows, n]."""
         return self._pitched(rows)[:, : self.count] if self.count else self._pitched(rows)
 
-    def carried(self) -> dict:
+    def persistent_arrays(self) -> dict:
         """Return the arrays that the next search reads, by name."""
-        return neighbors.carried_lists(self._lists)
+        return neighbors.persistent_lists(self._lists)
 
     def pack(self, positions, moments):
         """Pack positions [m] and moments [A·m²], Warp arrays of vectors, shape [n]."""
         if self.count:
-            lists = self._lists
-            wp.launch(
-                _pack_kernel(self.dtype),
-                dim=self.count,
-                inputs=[positions, moments, self.radii, self.labels, lists.found_at],
-                outputs=[self.packed, lists.moved],
-                device=self.device,
-            )
+            inputs = [positions, moments, self.radii, self.labels, self._lists.found_at]
+            outputs = [self.packed, self._lists.moved]
+            wp.launch(_pack_kernel(self.dtype), self.count, inputs=inputs, outputs=outputs, device=self.device)
 
     def find_overlaps(self, sources: "PackedMoments | None" = None):
         """List the ``sources`` that overlap each of these moments; None means these moments themselves."""
@@ -161,13 +149,7 @@ def _divide_kernel(dtype):
     vec3 = wp.types.vector(3, dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def divide_by_volume(
-        # inputs:
-        moments: wp.array[vec3],
-        radii: wp.array[dtype],
-        # outputs:
-        magnetizations_out: wp.array[vec3],
-    ):
+    def divide_by_volume(moments: wp.array[vec3], radii: wp.array[dtype], magnetizations_out: wp.array[vec3]):
         i = wp.tid()
         volume = ball_volume(radii[i])
         m = vec3()
@@ -180,10 +162,5 @@ def _divide_kernel(dtype):
 
 def launch_divide_by_volume(moments, radii, magnetizations):
     """Write the magnetizations M = m/V [A/m] of balls, shape [n]; zero where the radius is zero."""
-    wp.launch(
-        _divide_kernel(radii.dtype),
-        dim=radii.shape[0],
-        inputs=[moments, radii],
-        outputs=[magnetizations],
-        device=radii.device,
-    )
+    inputs, outputs = [moments, radii], [magnetizations]
+    wp.launch(_divide_kernel(radii.dtype), radii.shape[0], inputs=inputs, outputs=outputs, device=radii.device)

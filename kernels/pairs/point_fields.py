@@ -23,7 +23,6 @@ def _flux_density_kernel(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def flux_density(
-        # inputs:
         points: wp.array[vec3],
         sources: wp.array2d[dtype],
         source_count: int,
@@ -32,7 +31,6 @@ def _flux_density_kernel(dtype):
         overlaps: wp.array2d[int],
         overlap_counts: wp.array[int],
         h: wp.array[vec3],
-        # outputs:
         b_out: wp.array[vec3],
     ):
         i = wp.tid()
@@ -51,25 +49,13 @@ def _flux_density_kernel(dtype):
 
 
 def launch_flux_density(points, targets: PackedMoments, sources: PackedMoments, h, b):
-    """Write B = μ0 (H + M) [T] at points, where M is the sum of the magnetizations of the balls that contain a point.
+    """Write B = μ0 (H + M) [T] at points [m], with M the sum of the magnetizations of the balls that contain a point.
 
-    Args:
-        points: Points [m], Warp array of vectors, shape [p].
-        targets: Points packed as balls of radius zero, with their overlaps listed.
-        sources: Packed balls.
-        h: Field at the points [A/m], shape [p].
-        b: Out, flux density [T], shape [p].
+    ``targets`` are the points packed as balls of radius zero, with overlaps listed; ``h`` is the field there [A/m].
     """
-    wp.launch(
-        _flux_density_kernel(targets.dtype),
-        dim=targets.count,
-        inputs=[
-            *(points, sources.packed, sources.count, targets.groups, sources.groups),
-            *(targets.overlaps, targets.overlap_counts, h),
-        ],
-        outputs=[b],
-        device=targets.device,
-    )
+    inputs = [points, sources.packed, sources.count, targets.groups, sources.groups]
+    inputs += [targets.overlaps, targets.overlap_counts, h]
+    wp.launch(_flux_density_kernel(targets.dtype), targets.count, inputs=inputs, outputs=[b], device=targets.device)
 
 
 @cache
@@ -84,25 +70,15 @@ def _world_field_kernel(vec3):
 
 def launch_field_of_worlds(external_field, first, base):
     """Write the external field [A/m] at points, shape [p]: its value at ``first``, a moment of each point's world."""
-    wp.launch(
-        _world_field_kernel(base.dtype),
-        dim=len(base),
-        inputs=[external_field, first],
-        outputs=[base],
-        device=base.device,
-    )
+    inputs = [external_field, first]
+    wp.launch(_world_field_kernel(base.dtype), len(base), inputs=inputs, outputs=[base], device=base.device)
 
 
 @cache
 def _gradient_kernel(vec3, mat33):
     @wp.kernel(module="unique", enable_backward=False)
     def store_gradients(
-        # inputs:
-        along_x: wp.array[vec3],
-        along_y: wp.array[vec3],
-        along_z: wp.array[vec3],
-        # outputs:
-        gradients_out: wp.array[mat33],
+        along_x: wp.array[vec3], along_y: wp.array[vec3], along_z: wp.array[vec3], gradients_out: wp.array[mat33]
     ):
         i = wp.tid()
         gradients_out[i] = wp.matrix_from_cols(along_x[i], along_y[i], along_z[i])
@@ -112,10 +88,5 @@ def _gradient_kernel(vec3, mat33):
 
 def launch_store_gradients(along, gradients):
     """Write gradients [A/m²], matrices of shape [p], from the derivatives of H along x, y and z, vectors."""
-    wp.launch(
-        _gradient_kernel(along[0].dtype, gradients.dtype),
-        dim=len(gradients),
-        inputs=along,
-        outputs=[gradients],
-        device=gradients.device,
-    )
+    kernel, device = _gradient_kernel(along[0].dtype, gradients.dtype), gradients.device
+    wp.launch(kernel, dim=len(gradients), inputs=along, outputs=[gradients], device=device)

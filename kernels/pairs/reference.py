@@ -52,20 +52,11 @@ def _kernel(dtype, quantity: Quantity):
 
 
 def launch_reference_sums(quantity: Quantity, arrays, smoothing: float):
-    """Sum a quantity over all pairs of target rows and their sources.
+    """Sum ``FIELD``, ``FORCE`` or ``WRENCH`` over all pairs of target rows and their sources, to one partial sum.
 
     A field leaves out the target itself if targets and sources are the same. A force leaves out sources with the
-    target's label.
-
-    Args:
-        quantity: ``FIELD``, ``FORCE`` or ``WRENCH``.
-        arrays: Struct of ``work_list.arrays_type`` with one partial sum.
-        smoothing: Length ℓ [m] of the paper's smoothing; 0 for none.
+    target's label. ``smoothing`` is the length ℓ [m] of the paper's smoothing; 0 for none.
     """
-    dtype = arrays.partial.dtype
-    wp.launch(
-        _kernel(dtype, quantity),
-        dim=arrays.target.shape[0],
-        inputs=[arrays, dtype(smoothing**5)],
-        device=arrays.partial.device,
-    )
+    dtype, rows = arrays.partial.dtype, arrays.target.shape[0]
+    inputs = [arrays, dtype(smoothing**5)]
+    wp.launch(_kernel(dtype, quantity), dim=rows, inputs=inputs, device=arrays.partial.device)

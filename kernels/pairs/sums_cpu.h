@@ -188,11 +188,11 @@ template <Quantity Q> inline Kind kind_of(const Tile& a, const Tile& b) {
 
 // Adds the results of targets to the partial sums, from vectors of each of their sums.
 template <Quantity Q>
-inline void add_results(const Share& share, Real* out, int column, int held, Simd (&rows)[SUMS<Q>][LANES]) {
+inline void add_results(const Share& share, Real* out, int column, int lane_count, Simd (&rows)[SUMS<Q>][LANES]) {
     Simd summed[10] = {};
     for (int k = 0, used = 0; k < 10; ++k)
         if (is_summed<Q>(k)) summed[k] = totals(rows[used++]);
-    for (int l = 0; l < held; ++l, out += width(Q)) {
+    for (int l = 0; l < lane_count; ++l, out += width(Q)) {
         const auto sum = [&](int k) { return number(summed + k, l); };
         const auto vector = [&](int k) -> Vec3<Real> { return {sum(k), sum(k + 1), sum(k + 2)}; };
         const Vec3<Real> e = Q == Quantity::FIELD ? Vec3<Real>{} : share.effective.vector(0, column + l);
@@ -276,9 +276,9 @@ __attribute__((noinline)) void sum_pairs(const Share& share, Tile& targets, Tile
         return sums;
     };
     for (int i = 0; i < targets.count; i += LANES) {
-        const int held = targets.count - i < LANES ? targets.count - i : LANES;
+        const int lane_count = targets.count - i < LANES ? targets.count - i : LANES;
         Simd rows[SUMS<Q>][LANES] = {};
-        for (int l = 0; l < held; ++l) {
+        for (int l = 0; l < lane_count; ++l) {
             const Own own(share, targets, sources, i + l, !BOTH && Q == Quantity::FIELD);
             const Sums<Simd> sums = sum_row(i + l);
             for (int k = 0, used = 0; k < 10; ++k)
@@ -286,7 +286,7 @@ __attribute__((noinline)) void sum_pairs(const Share& share, Tile& targets, Tile
         }
         if constexpr (BOTH)
             for (int c = 0; c < 3; ++c) targets.sums[c][i / LANES] += totals(rows[c]);
-        else add_results<Q>(share, out + (size_t)i * width(Q), targets.begin + i, held, rows);
+        else add_results<Q>(share, out + (size_t)i * width(Q), targets.begin + i, lane_count, rows);
     }
 }
 
@@ -301,8 +301,8 @@ template <Quantity Q, bool BOTH> inline void sum_all_pairs(const Share& share, T
 __attribute__((noinline)) inline void add_tile_sums(const Tile& tile, Real* out) {
     for (int i = 0; i < tile.count; i += WIDTH, out += 3 * WIDTH) {
         const auto h = [&](int c) { return warpmag::numbers((const Real*)tile.sums[c] + i); };
-        const int held = tile.count - i;
-        put_vectors(out, held, warpmag::vectors(out, held) + H_FACTOR * Vector{h(0), h(1), h(2)});
+        const int lane_count = tile.count - i;
+        put_vectors(out, lane_count, warpmag::vectors(out, lane_count) + H_FACTOR * Vector{h(0), h(1), h(2)});
     }
 }
 

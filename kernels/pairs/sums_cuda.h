@@ -30,12 +30,13 @@ CUDA_CALLABLE inline void sum_tile(int thread, const wp::array_t<int>& tiles, co
         const Moment t = target_rows.moment(column);
         return {t.x, t.radius, t.label, FIELD ? Vec3<Real>{} : effective_rows.vector(0, column)};
     };
-    LaneTargets<Q, TARGETS> held;
-    add_sources<32, UNROLLED, true>(held, target_at, sources, source_begin, source_end, 0, same ? column_begin : FAR,
-                                    same ? count : 0, lane, staging[warp]);
+    LaneTargets<Q, TARGETS> lane_targets;
+    add_sources<32, UNROLLED, true>(lane_targets, target_at, sources, source_begin, source_end, 0,
+                                    same ? column_begin : FAR, same ? count : 0, lane, staging[warp]);
     Real* warp_sums = (Real*)staging[warp];
 #pragma unroll
-    for (int k = 0; k < TARGETS; ++k) results<Q>(held.sums[k], held.targets[k].e, warp_sums + (lane + 32 * k) * WIDTH);
+    for (int k = 0; k < TARGETS; ++k)
+        results<Q>(lane_targets.sums[k], lane_targets.targets[k].e, warp_sums + (lane + 32 * k) * WIDTH);
     __syncthreads();
     Real* out = partial_out.data + ((size_t)split * partial_out.shape[1] + row_begin) * WIDTH;
     sum_warps(staging, thread % (32 * WARPS), WIDTH * count, [&](int item, Real total) { out[item] = total; });

@@ -15,17 +15,11 @@ from warpmag.kernels.shared.native import native_kernel
 
 @dataclass(frozen=True)
 class LoopShape:
-    """Shape of the blocks.
+    """Shape of the blocks."""
 
-    Attributes:
-        targets: Targets per lane; a tile has 32 times as many.
-        warps: Warps per block.
-        blocks: Resident blocks per multiprocessor, in float32.
-    """
-
-    targets: int
-    warps: int
-    blocks: int
+    targets: int  # targets per lane; a tile has 32 times as many
+    warps: int  # Warps per block
+    blocks: int  # resident blocks per multiprocessor, in float32
 
 
 # Measured on an H200 at 243 to 131,072 targets: most targets for which a shape is fastest, and the shape.
@@ -47,11 +41,7 @@ def choose_loop_shape(quantity: Quantity, count: int) -> LoopShape:
 def choose_splits(shape: LoopShape, tiles: int, longest: int, multiprocessors: int) -> int:
     """Return the fastest number of blocks that share the sources of a tile.
 
-    Args:
-        shape: Shape of the blocks.
-        tiles: Number of tiles before splitting.
-        longest: Number of sources of the longest tile.
-        multiprocessors: Multiprocessors of the device.
+    ``tiles`` counts tiles before splitting; ``longest`` is the number of sources of the longest tile.
     """
 
     def cost(splits):
@@ -65,11 +55,7 @@ def choose_splits(shape: LoopShape, tiles: int, longest: int, multiprocessors: i
 def launch_time(blocks: int, together: int, work: float, multiprocessors: int) -> tuple[float, int]:
     """Estimate the time of equal blocks, and the number of waves in which they run.
 
-    Args:
-        blocks: Number of blocks.
-        together: Resident blocks per multiprocessor.
-        work: Time of ``together`` blocks on a multiprocessor.
-        multiprocessors: Multiprocessors of the device.
+    ``together`` blocks are resident on a multiprocessor, and take the time ``work`` there.
     """
     waves, rest = divmod(blocks, multiprocessors * together)
     if rest == 0:
@@ -82,15 +68,12 @@ def launch_time(blocks: int, together: int, work: float, multiprocessors: int) -
 @cache
 def _kernel(dtype, quantity: Quantity, shape: LoopShape):
     bounds = 32 * shape.warps, shape.blocks if dtype is wp.float32 else 1
+    moments = dict.fromkeys(("targets", "sources", "effective"), wp.array2d[dtype])
     return native_kernel(
         f"sum_tile<warpmag::Quantity({quantity:d}), {shape.targets}, {shape.warps}>"
         "(thread, tiles, targets, sources, effective, partial_out)",
         "pairs/sums_cuda.h",
-        {
-            "tiles": wp.array2d[int],
-            **dict.fromkeys(("targets", "sources", "effective"), wp.array2d[dtype]),
-            "partial_out": wp.array3d[dtype],
-        },
+        {"tiles": wp.array2d[int], **moments, "partial_out": wp.array3d[dtype]},
         dtype=dtype,
         launch={"grid_stride": False, "launch_bounds": bounds},
     )
@@ -98,11 +81,6 @@ def _kernel(dtype, quantity: Quantity, shape: LoopShape):
 
 def launch_pair_loop_cuda(quantity: Quantity, shape: LoopShape, targets, sources, effective, tiles, partial):
     """Sum a quantity over all tiles; see ``evaluate``."""
-    wp.launch(
-        _kernel(partial.dtype, quantity, shape),
-        dim=tiles.shape[0] * 32 * shape.warps,
-        inputs=[tiles, targets, sources, effective],
-        outputs=[partial],
-        device=partial.device,
-        block_dim=32 * shape.warps,
-    )
+    kernel, block, device = _kernel(partial.dtype, quantity, shape), 32 * shape.warps, partial.device
+    inputs = [tiles, targets, sources, effective]
+    wp.launch(kernel, tiles.shape[0] * block, inputs=inputs, outputs=[partial], device=device, block_dim=block)

@@ -129,9 +129,10 @@ struct LabelRange {
 // constant of the target, and a pair takes 20 instructions for the field and 31 for the force. In addition a source
 // takes about four for all targets of a lane, and the staging of 32 sources about sixty. A LONG sum takes the radius
 // from each stage and decides for the whole stage. It adds up partial sums, which keeps it accurate.
-template <int LANES, int UNROLLED, bool LONG, Quantity Q, int HELD, class TargetAt, class Sources>
-CUDA_CALLABLE inline void add_sources(LaneTargets<Q, HELD>& held, TargetAt target_at, const Sources& sources, int begin,
-                                      int end, Real radius, int own_begin, unsigned own_count, int lane, Quad* staged) {
+template <int LANES, int UNROLLED, bool LONG, Quantity Q, int TARGETS, class TargetAt, class Sources>
+CUDA_CALLABLE inline void add_sources(LaneTargets<Q, TARGETS>& lane_targets, TargetAt target_at, const Sources& sources,
+                                      int begin, int end, Real radius, int own_begin, unsigned own_count, int lane,
+                                      Quad* staged) {
     constexpr bool FIELD = Q == Quantity::FIELD;
     constexpr Real SCALE = scaled_moment(Q);
     constexpr int GROUPS = 32 / LANES, STRIDE = GROUPS * UNROLLED, STAGES_PER_PART = 16;
@@ -146,11 +147,11 @@ CUDA_CALLABLE inline void add_sources(LaneTargets<Q, HELD>& held, TargetAt targe
     Moment s;
     if (begin < end) s = load(begin + lane);
 #pragma unroll
-    for (int k = 0; k < HELD; ++k) held.targets[k] = target_at(k);
+    for (int k = 0; k < TARGETS; ++k) lane_targets.targets[k] = target_at(k);
     LabelRange labels;
-    if constexpr (!FIELD) labels = LabelRange::of<LANES>(held.targets);
-    if constexpr (!LONG) held.clamp_for(radius);
-    Sums<Real> long_sums[HELD];
+    if constexpr (!FIELD) labels = LabelRange::of<LANES>(lane_targets.targets);
+    if constexpr (!LONG) lane_targets.clamp_for(radius);
+    Sums<Real> long_sums[TARGETS];
 #pragma unroll 1
     for (int base = begin; base < end; base += 32) {
         const int j = base + lane, count = min(32, end - base);
@@ -163,7 +164,7 @@ CUDA_CALLABLE inline void add_sources(LaneTargets<Q, HELD>& held, TargetAt targe
         ((Pair*)(staged + 64))[lane] = {s.radius, FIELD ? 0 : s.label};
         __syncwarp();
         if (base + 32 < end) s = load(j + 32);
-        if constexpr (LONG) held.clamp_for(radius);
+        if constexpr (LONG) lane_targets.clamp_for(radius);
 #pragma unroll 1
         for (int first = 0; first < count; first += RUN) {
             const int last = LONG ? count : first + RUN;
@@ -171,28 +172,29 @@ CUDA_CALLABLE inline void add_sources(LaneTargets<Q, HELD>& held, TargetAt targe
 #pragma unroll 1
                 for (int step = first; step < last; step += STRIDE)
 #pragma unroll
-                    for (int i = 0; i < UNROLLED; ++i) held.add(source_at(step + GROUPS * i + lane / LANES));
+                    for (int i = 0; i < UNROLLED; ++i) lane_targets.add(source_at(step + GROUPS * i + lane / LANES));
             } else {
 #pragma unroll 1
                 for (int i = first + lane / LANES; i < last; i += GROUPS) {
                     const Pair c = ((const Pair*)(staged + 64))[i];
                     const int offset = base + i - own_begin - lane % LANES;
-                    held.add_masked(source_at(i), c.x,
-                                    [&](int k) { return FIELD ? offset == LANES * k : c.y == held.targets[k].label; });
+                    lane_targets.add_masked(source_at(i), c.x, [&](int k) {
+                        return FIELD ? offset == LANES * k : c.y == lane_targets.targets[k].label;
+                    });
                 }
             }
         }
         __syncwarp();
         if (LONG && (base - begin) % (32 * STAGES_PER_PART) == 32 * (STAGES_PER_PART - 1)) {
 #pragma unroll
-            for (int k = 0; k < HELD; ++k) {
-                long_sums[k] += held.sums[k];
-                held.sums[k] = {};
+            for (int k = 0; k < TARGETS; ++k) {
+                long_sums[k] += lane_targets.sums[k];
+                lane_targets.sums[k] = {};
             }
         }
     }
 #pragma unroll
-    for (int k = 0; k < HELD && LONG; ++k) held.sums[k] += long_sums[k];
+    for (int k = 0; k < TARGETS && LONG; ++k) lane_targets.sums[k] += long_sums[k];
 }
 
 // Adds up the sums of a block's warps in shared memory, in order, and calls store(item, total) for each item.

@@ -31,12 +31,7 @@ _LANES = 16
 
 
 def target_rows(segments, device):
-    """Return the packed column, first source and end of sources of each target row, as Warp arrays.
-
-    Args:
-        segments: Integers [k, 4]: targets begin and end, sources begin and end, as packed columns.
-        device: Warp device.
-    """
+    """Return the packed column, first source and end of sources of each target row, as Warp arrays."""
     sizes, starts, segments = segments[:, 1] - segments[:, 0], row_starts(segments), segments.astype(np.int32)
     target = np.arange(starts[-1], dtype=np.int32) + np.repeat(segments[:, 0] - starts[:-1].astype(np.int32), sizes)
     rows = target, np.repeat(segments[:, 2], sizes), np.repeat(segments[:, 3], sizes)

@@ -32,7 +32,6 @@ def _zeeman_kernel(dtype):
 
     @wp.kernel(module="unique", enable_backward=False, module_options=native_options("material/curves.h", dtype=dtype))
     def zeeman_moments(
-        # inputs:
         packed: wp.array2d[dtype],
         h: wp.array[vec3],
         inducible: wp.array[int],
@@ -40,7 +39,6 @@ def _zeeman_kernel(dtype):
         slope: wp.array[dtype],
         curve: wp.array[int],
         tables: wp.array2d[dtype],
-        # outputs:
         effective_out: wp.array2d[dtype],
     ):
         i = wp.tid()
@@ -57,21 +55,8 @@ def _zeeman_kernel(dtype):
 
 
 def launch_zeeman_moments(moments, h, material: CurveParameters, effective):
-    """Write the effective moments of the Zeeman law.
-
-    Args:
-        moments: Packed moments (``packing.PackedMoments``).
-        h: Total field at inducible moments [A/m], shape [n].
-        material: Magnetization curves of the moments.
-        effective: Out, effective moments [A·m²], shape [3, n].
-    """
-    wp.launch(
-        _zeeman_kernel(effective.dtype),
-        dim=moments.count,
-        inputs=[
-            *(moments.packed, h, material.inducible),
-            *(material.saturation, material.slope, material.curve, material.tables),
-        ],
-        outputs=[effective],
-        device=effective.device,
-    )
+    """Write the effective moments of the Zeeman law [A·m²], shape [3, n]; h is the total field [A/m], shape [n]."""
+    kernel, device = _zeeman_kernel(effective.dtype), effective.device
+    inputs = [moments.packed, h, material.inducible]
+    inputs += [material.saturation, material.slope, material.curve, material.tables]
+    wp.launch(kernel, dim=moments.count, inputs=inputs, outputs=[effective], device=device)

@@ -11,7 +11,7 @@ a body.
 
 import warp as wp
 
-from warpmag.kernels.rigid.newton_views import BodyView, velocity_at, view_bodies
+from warpmag.kernels.rigid.newton_views import BodyView, body_pose, velocity_at, view_bodies
 from warpmag.kernels.shared.reductions import group_sum
 
 wp.set_module_options({"enable_backward": False})
@@ -23,45 +23,30 @@ _sum_group = group_sum(wp.spatial_vectord)
 
 @wp.struct
 class BodyMoments:
-    """Moments and their bodies, for n moments in r runs of consecutive moments on b bodies.
+    """Moments and their bodies, for n moments in r runs of consecutive moments on b bodies."""
 
-    Attributes:
-        body: Body of each moment, -1 where the magnet is fixed in the world, shape [n].
-        permanent: True for permanent moments, shape [n].
-        local_positions: Position in the body's frame [m], shape [n].
-        volumes: Volume of each moment [m³], shape [n].
-        shape: Shape of each moment, shape [n].
-        shape_frames, magnetizations: Frame of each shape in its body's frame, and its permanent magnetization in the
-            shape's frame [A/m]: arrays of the model, shape [shapes].
-        body_list, body_run_start: Bodies with moments, and the first run of each, shape [b] and [b + 1].
-        runs: First moment of each run, and the index after its last, shape [r].
-        kinematic_flag: Newton's flag of bodies that forces do not move.
-    """
-
-    body: wp.array[wp.int32]
-    permanent: wp.array[wp.bool]
-    local_positions: wp.array[wp.vec3]
-    volumes: wp.array[float]
-    shape: wp.array[wp.int32]
+    body: wp.array[wp.int32]  # body of each moment, -1 where the magnet is fixed in the world, shape [n]
+    permanent: wp.array[wp.bool]  # true for permanent moments, shape [n]
+    local_positions: wp.array[wp.vec3]  # position in the body's frame [m], shape [n]
+    volumes: wp.array[float]  # volume of each moment [m³], shape [n]
+    shape: wp.array[wp.int32]  # shape of each moment, shape [n]
+    # Frame of each shape in its body's frame, and its permanent magnetization in the shape's frame [A/m]: arrays of the
+    # model, shape [shapes].
     shape_frames: wp.array[wp.transform]
     magnetizations: wp.array[wp.vec3]
+    # Bodies with moments, and the first run of each, shape [b] and [b + 1].
     body_list: wp.array[wp.int32]
     body_run_start: wp.array[wp.int32]
-    runs: wp.array[wp.vec2i]
-    kinematic_flag: int
+    runs: wp.array[wp.vec2i]  # first moment of each run, and the index after its last, shape [r]
+    kinematic_flag: int  # Newton's flag of bodies that forces do not move
 
 
 @wp.struct
 class ShapeMagnets:
-    """Magnetic attributes of a model's shapes: arrays of the model or copies of them, shape [shapes].
+    """Magnetic attributes of a model's shapes: arrays of the model or copies of them, shape [shapes]."""
 
-    Attributes:
-        kind: Kind of magnet, 0 for other shapes.
-        saturation, susceptibility, curve, recoil_permeability, moment_spacing, conductivity: As in
-            ``warpmag.engine.magnets.attributes``.
-    """
-
-    kind: wp.array[wp.int32]
+    kind: wp.array[wp.int32]  # kind of magnet, 0 for other shapes
+    # As in ``warpmag.engine.magnets.attributes``.
     saturation: wp.array[float]
     susceptibility: wp.array[float]
     curve: wp.array[wp.int32]
@@ -85,12 +70,10 @@ def _have_same_magnet(a: ShapeMagnets, b: ShapeMagnets, shape: int) -> bool:
 
 @wp.kernel
 def _gather_moments(
-    # inputs:
     body_q_in: wp.array[wp.transform],
     magnets: BodyMoments,
     present: ShapeMagnets,
     initial: ShapeMagnets,
-    # outputs:
     positions_out: wp.array[wp.vec3],
     moments_out: wp.array[wp.vec3],
     changed_out: wp.array[wp.int32],
@@ -101,10 +84,7 @@ def _gather_moments(
             wp.atomic_max(changed_out, 0, i + 1)
     if i >= positions_out.shape[0]:
         return
-    frame = wp.transform_identity()
-    body = magnets.body[i]
-    if body >= 0:
-        frame = body_q_in[body]
+    frame = body_pose(body_q_in, magnets.body[i])
     positions_out[i] = wp.transform_point(frame, magnets.local_positions[i])
     if magnets.permanent[i]:
         shape = magnets.shape[i]
@@ -136,10 +116,7 @@ def _gather_bias(
 ):
     k = wp.tid()
     i = moments_in[k]
-    frame = wp.transform_identity()
-    body = magnets.body[i]
-    if body >= 0:
-        frame = body_q_in[body]
+    frame = body_pose(body_q_in, magnets.body[i])
     shape = magnets.shape[i]
     bias = factors_in[k] * magnets.magnetizations[shape]
     bias_out[i] = wp.transform_vector(frame, wp.transform_vector(magnets.shape_frames[shape], bias))
@@ -216,7 +193,6 @@ def set_external_field(field, worlds, external_field):
 
 @wp.kernel
 def _add_wrenches(
-    # inputs:
     magnets: BodyMoments,
     body_q_in: wp.array[wp.transform],
     body_com_in: wp.array[wp.vec3],
@@ -225,7 +201,6 @@ def _add_wrenches(
     forces_in: wp.array[wp.vec3],
     torques_in: wp.array[wp.vec3],
     threads: int,
-    # outputs:
     body_f_out: wp.array[wp.spatial_vector],
 ):
     k = wp.tid() // threads
@@ -259,12 +234,7 @@ def add_wrenches(magnets: BodyMoments, model, state, positions, forces, torques)
 
 @wp.kernel
 def _gather_motion(
-    # inputs:
-    bodies: BodyView,
-    magnets: BodyMoments,
-    positions_in: wp.array[wp.vec3],
-    # outputs:
-    motion_out: wp.array2d[float],
+    bodies: BodyView, magnets: BodyMoments, positions_in: wp.array[wp.vec3], motion_out: wp.array2d[float]
 ):
     i = wp.tid()
     body = magnets.body[i]

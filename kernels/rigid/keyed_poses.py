@@ -34,26 +34,16 @@ _RADIANS = wp.constant(wp.float64(np.pi / 180.0))
 
 @wp.struct
 class KeyedPoses:
-    """Bodies that follow keys, for b bodies with o transforms.
+    """Bodies that follow keys, for b bodies with o transforms."""
 
-    Attributes:
-        keyed: The keys, a curve for each transform.
-        kind: Index of each transform's type in ``TRANSFORMS``, shape [o].
-        inverse: 1 for inverted transforms, shape [o].
-        first: First (outermost) transform of each body, and the one after the last, shape [b + 1].
-        body: Index of each body in the model, shape [b].
-        com: Centers of mass of all bodies in their frames [m].
-        joint: Free joint of each body, -1 for bodies without one, shape [b].
-        joint_q_start, joint_qd_start, parent_frame, child_frame: Newton's arrays of all joints.
-    """
-
-    keyed: KeyedValues
-    kind: wp.array[wp.int32]
-    inverse: wp.array[wp.int32]
-    first: wp.array[wp.int32]
-    body: wp.array[wp.int32]
-    com: wp.array[wp.vec3]
-    joint: wp.array[wp.int32]
+    keyed: KeyedValues  # the keys, a curve for each transform
+    kind: wp.array[wp.int32]  # index of each transform's type in ``TRANSFORMS``, shape [o]
+    inverse: wp.array[wp.int32]  # 1 for inverted transforms, shape [o]
+    first: wp.array[wp.int32]  # first (outermost) transform of each body, and the one after the last, shape [b + 1]
+    body: wp.array[wp.int32]  # index of each body in the model, shape [b]
+    com: wp.array[wp.vec3]  # centers of mass of all bodies in their frames [m]
+    joint: wp.array[wp.int32]  # free joint of each body, -1 for bodies without one, shape [b]
+    # Newton's arrays of all joints.
     joint_q_start: wp.array[wp.int32]
     joint_qd_start: wp.array[wp.int32]
     parent_frame: wp.array[wp.transform]
@@ -141,11 +131,6 @@ def _pose(poses: KeyedPoses, k: int, time: wp.float64) -> wp.transformd:
 
 
 @wp.func
-def _to_float32(v: wp.vec3d) -> wp.vec3:
-    return wp.vec3(float(v[0]), float(v[1]), float(v[2]))
-
-
-@wp.func
 def _write_joint(
     poses: KeyedPoses, joint: int, pose: wp.transform, qd: wp.spatial_vector, joint_q: wp.array[float],
     joint_qd: wp.array[float],
@@ -164,13 +149,11 @@ def _write_joint(
 
 @wp.kernel
 def _write_poses(
-    # inputs:
     poses: KeyedPoses,
     time_in: wp.array[wp.float64],
     begin: wp.float64,
     duration: wp.float64,
     at_end: int,
-    # outputs:
     body_q_out: wp.array[wp.transform],
     body_qd_out: wp.array[wp.spatial_vector],
     joint_q_out: wp.array[float],
@@ -189,10 +172,10 @@ def _write_poses(
     rate = wp.float64(2.0)  # limit of angle / sin(angle / 2) at small angles
     if sine > wp.float64(1e-12):
         rate = wp.float64(2.0) * wp.atan2(sine, w) / sine
-    qd = wp.spatial_vector(_to_float32(moved / duration), _to_float32((rate / duration) * axis))
+    qd = wp.spatial_vector(wp.vec3(moved / duration), wp.vec3((rate / duration) * axis))
     frame = wp.where(at_end != 0, pose1, pose0)
-    p, q = wp.transform_get_translation(frame), wp.transform_get_rotation(frame)
-    pose = wp.transform(_to_float32(p), wp.quat(float(q[0]), float(q[1]), float(q[2]), float(q[3])))
+    rotation = wp.quaternion(wp.transform_get_rotation(frame), dtype=wp.float32)
+    pose = wp.transform(wp.vec3(wp.transform_get_translation(frame)), rotation)
     body_q_out[body] = pose
     body_qd_out[body] = qd
     if poses.joint[k] >= 0:
@@ -201,25 +184,17 @@ def _write_poses(
 
 @dataclass(frozen=True)
 class PosedBodies:
-    """Bodies of a model that follow keys by a clock.
+    """Bodies of a model that follow keys by a clock."""
 
-    Attributes:
-        arrays: Arrays of the kernels, :class:`KeyedPoses`.
-        time: Time on the device [s], shape [1].
-    """
-
-    arrays: Any
-    time: wp.array
+    arrays: Any  # arrays of the kernels, :class:`KeyedPoses`
+    time: wp.array  # time on the device [s], shape [1]
 
 
 def pose_bodies(bodies: dict[int, Sequence], joints: Sequence[int], model, time: wp.array) -> PosedBodies:
-    """Return bodies that follow keys.
+    """Return bodies that follow keys, with the time on the device [s], float64, shape [1].
 
-    Args:
-        bodies: Transforms of each body, the outermost first, with ``kind``, ``keys`` and ``inverse``.
-        joints: Free joint of each of these bodies, -1 for bodies without one.
-        model: Newton's model.
-        time: Time on the device [s], float64, shape [1].
+    Each body has transforms, the outermost first, with ``kind``, ``keys`` and ``inverse``. ``joints`` are the bodies'
+    free joints, -1 for bodies without one.
     """
     transforms = [transform for own in bodies.values() for transform in own]
 
@@ -238,15 +213,11 @@ def pose_bodies(bodies: dict[int, Sequence], joints: Sequence[int], model, time:
     return PosedBodies(a, time)
 
 
-def launch_place(bodies: PosedBodies, state, begin: float, duration: float, *, at_end: bool):
+def write_keyed_poses(bodies: PosedBodies, state, begin: float, duration: float, *, at_end: bool):
     """Write poses, and the mean velocities over an interval, of bodies to a state; capturable in a graph.
 
-    Args:
-        bodies: The bodies.
-        state: Newton's state; coordinates of free joints are written, too.
-        begin: Start of the interval [s], relative to the clock.
-        duration: Length of the interval [s].
-        at_end: True for the poses at the interval's end, false for those at its start.
+    The interval of length ``duration`` [s] starts at ``begin`` [s], relative to the clock. Poses are those at its end
+    or at its start. Coordinates of free joints are written, too.
     """
     inputs = [bodies.arrays, bodies.time, wp.float64(begin), wp.float64(duration), int(at_end)]
     outputs = [state.body_q, state.body_qd, state.joint_q, state.joint_qd]

@@ -22,31 +22,20 @@ _LINEAR_LIMIT = wp.constant(wp.float64(1e-5))
 
 @wp.struct
 class KeyedValues:
-    """Curves of keys, for k keys in c curves.
+    """Curves of keys, for k keys in c curves."""
 
-    Attributes:
-        times: Times of the keys [s], ascending in each curve, shape [k].
-        values: Numbers of all keys, one key after the other.
-        first: First key of each curve, and the one after the last, shape [c + 1].
-        place: Index of each curve's first number in ``values``, shape [c].
-        width: Numbers of a key, shape [c].
-        interpolation: Index in ``INTERPOLATIONS``, shape [c].
-    """
-
-    times: wp.array[wp.float64]
-    values: wp.array[wp.float64]
-    first: wp.array[wp.int32]
-    place: wp.array[wp.int32]
-    width: wp.array[wp.int32]
-    interpolation: wp.array[wp.int32]
+    times: wp.array[wp.float64]  # times of the keys [s], ascending in each curve, shape [k]
+    values: wp.array[wp.float64]  # numbers of all keys, one key after the other
+    first: wp.array[wp.int32]  # first key of each curve, and the one after the last, shape [c + 1]
+    place: wp.array[wp.int32]  # index of each curve's first number in ``values``, shape [c]
+    width: wp.array[wp.int32]  # numbers of a key, shape [c]
+    interpolation: wp.array[wp.int32]  # index in ``INTERPOLATIONS``, shape [c]
 
 
 def keyed_values(curves: Sequence, device) -> Any:
     """Return :class:`KeyedValues` on a device.
 
-    Args:
-        curves: Objects with ``times`` [s], shape [k], ``values``, shape [k, width], and ``interpolation``.
-        device: Warp device.
+    ``curves`` have ``times`` [s], shape [k], ``values``, shape [k, width], and ``interpolation``.
     """
 
     def put(values, dtype):
@@ -131,26 +120,15 @@ def interpolate_quaternion(keyed: KeyedValues, curve: int, key: int, fraction: w
 
 @wp.struct
 class Clock:
-    """Time on the device, and the number of substeps that share values.
+    """Time on the device, and the number of substeps that share values."""
 
-    Attributes:
-        time: Time [s], shape [1].
-        shared: Number of substeps that share values, shape [1].
-    """
-
-    time: wp.array[wp.float64]
-    shared: wp.array[wp.int32]
+    time: wp.array[wp.float64]  # time [s], shape [1]
+    shared: wp.array[wp.int32]  # number of substeps that share values, shape [1]
 
 
 @wp.kernel
 def _write_values(
-    # inputs:
-    keyed: KeyedValues,
-    clock: Clock,
-    offset: wp.float64,
-    substep: wp.float64,
-    # outputs:
-    targets_out: wp.array[wp.uint64],
+    keyed: KeyedValues, clock: Clock, offset: wp.float64, substep: wp.float64, targets_out: wp.array[wp.uint64]
 ):
     curve = wp.tid()
     time = clock.time[0] + offset + wp.float64(0.5) * wp.float64(clock.shared[0] - 1) * substep
@@ -163,25 +141,17 @@ def _write_values(
 
 
 @dataclass(frozen=True)
-class Followers:
-    """Arrays on the device that follow keys.
+class KeyedArrays:
+    """Arrays on the device that follow keys."""
 
-    Attributes:
-        keyed: The curves.
-        targets: Arrays that receive the values; the reference keeps them alive.
-        addresses: Address of each.
-        time: Time on the device [s], shape [1].
-        single: The number 1, shape [1].
-    """
-
-    keyed: Any
-    targets: Sequence[wp.array]
-    addresses: wp.array
-    time: wp.array
-    single: wp.array
+    keyed: Any  # the curves
+    targets: Sequence[wp.array]  # arrays that receive the values; the reference keeps them alive
+    addresses: wp.array  # address of each
+    time: wp.array  # time on the device [s], shape [1]
+    single: wp.array  # the number 1, shape [1]
 
 
-def follow(curves: Sequence, targets: Sequence[wp.array], time: wp.array) -> Followers:
+def keyed_arrays(curves: Sequence, targets: Sequence[wp.array], time: wp.array) -> KeyedArrays:
     """Return arrays that follow keys.
 
     Args:
@@ -195,21 +165,22 @@ def follow(curves: Sequence, targets: Sequence[wp.array], time: wp.array) -> Fol
         assert target.is_contiguous, "a target is contiguous"
     addresses = wp.array(np.array([target.ptr for target in targets], np.uint64), device=time.device)
     single = wp.ones(1, dtype=wp.int32, device=time.device)
-    return Followers(keyed_values(curves, time.device), list(targets), addresses, time, single)
+    return KeyedArrays(keyed_values(curves, time.device), list(targets), addresses, time, single)
 
 
-def launch_follow(followers: Followers, offset: float = 0.0, *, shared: wp.array | None = None, substep: float = 0.0):
+def write_keyed_values(
+    arrays: KeyedArrays, offset: float = 0.0, *, shared: wp.array | None = None, substep: float = 0.0
+):
     """Write the values of all curves at a time, in one launch; capturable in a graph.
 
     Args:
-        followers: The arrays and their curves.
         offset: Time relative to the clock [s].
         shared: Number of substeps that share the values, shape [1]. The values are those halfway between the starts of
             the first and the last of these substeps. None means one.
         substep: Length of a substep [s].
     """
     clock = Clock()
-    clock.time, clock.shared = followers.time, followers.single if shared is None else shared
-    inputs = [followers.keyed, clock, wp.float64(offset), wp.float64(substep)]
-    outputs, device = [followers.addresses], followers.time.device
-    wp.launch(_write_values, dim=len(followers.targets), inputs=inputs, outputs=outputs, device=device)
+    clock.time, clock.shared = arrays.time, arrays.single if shared is None else shared
+    inputs = [arrays.keyed, clock, wp.float64(offset), wp.float64(substep)]
+    outputs, device = [arrays.addresses], arrays.time.device
+    wp.launch(_write_values, dim=len(arrays.targets), inputs=inputs, outputs=outputs, device=device)

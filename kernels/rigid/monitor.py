@@ -54,26 +54,21 @@ NEXT_SUBSTEP = -1
 
 @wp.struct
 class Monitor:
-    """Arrays of the monitor.
+    """Arrays of the monitor."""
 
-    Attributes:
-        thickness: Distance that a body may move before it can pass through another [m], the radius of a ball; infinite
-            for bodies that forces do not move. Shape [body_count].
-        reach: Largest displacement of a body's surface per radian [m], zero for a ball. Shape [body_count].
-        fills: Addresses of the number of used entries of each buffer; 0 for buffers of :func:`watch_flags`.
-        level: Number of times that substeps were halved, shape [1].
-        substeps: Number of completed substeps of this attempt, shape [1].
-        ticks: Time of each stage since the last accepted step, then the clock at the last mark; nanoseconds on a GPU,
-            clock cycles on a CPU.
-        peaks, counts: See the module's docstring.
-    """
-
+    # Distance that a body may move before it can pass through another [m], the radius of a ball; infinite for bodies
+    # that forces do not move. Shape [body_count].
     thickness: wp.array[float]
+    # Largest displacement of a body's surface per radian [m], zero for a ball. Shape [body_count].
     reach: wp.array[float]
-    fills: wp.array[wp.uint64]
-    level: wp.array[wp.int32]
-    substeps: wp.array[wp.int32]
+    # Addresses of the number of used entries of each buffer; 0 for buffers of :func:`watch_flags`.
+    fill_counts: wp.array[wp.uint64]
+    level: wp.array[wp.int32]  # number of times that substeps were halved, shape [1]
+    substeps: wp.array[wp.int32]  # number of completed substeps of this attempt, shape [1]
+    # Time of each stage since the last accepted step, then the clock at the last mark; nanoseconds on a GPU, clock
+    # cycles on a CPU.
     ticks: wp.array[wp.uint64]
+    # See the module's docstring.
     peaks: wp.array[float]
     counts: wp.array[wp.int32]
 
@@ -181,23 +176,21 @@ def _watch_contact(
 
 @wp.kernel
 def _watch(
-    # inputs:
     m: Monitor,
     contacts: ContactView,
     bodies: BodyView,
     substep: int,
     longest: float,
     overlap_threshold: float,
-    # outputs:
     overlaps_out: wp.array[float],
 ):
     i = wp.tid()
     dt = longest / float(1 << m.level[0])
     if i == 0:
         mark_time(m.ticks, RIGID)
-    if i < m.fills.shape[0]:
-        if m.fills[i] != wp.uint64(0):
-            fill = wp.array(ptr=m.fills[i], shape=(1,), dtype=wp.int32)
+    if i < m.fill_counts.shape[0]:
+        if m.fill_counts[i] != wp.uint64(0):
+            fill = wp.array(ptr=m.fill_counts[i], shape=(1,), dtype=wp.int32)
             m.counts[COUNT_CAPACITIES + i] = wp.max(m.counts[COUNT_CAPACITIES + i], fill[0])
     if i < bodies.qd.shape[0]:
         _watch_body(m, bodies, i, substep, dt)
@@ -213,15 +206,12 @@ def watch(m: Monitor, contacts: ContactView, bodies: BodyView, overlaps, *, subs
     substep.
 
     Args:
-        m: The monitor.
-        contacts: The contacts.
-        bodies: The bodies.
         overlaps: Out, depth of each contact over the thickness of its thinner body, shape [contact_max].
         substep: Index of the substep after ``m.substeps``, or ``NEXT_SUBSTEP``.
         longest: Length of the substeps of the first level [s].
         threshold: Overlap above which a contact is counted.
     """
-    dim = max(len(overlaps), len(m.thickness), len(m.fills), 1)
+    dim = max(len(overlaps), len(m.thickness), len(m.fill_counts), 1)
     inputs = [m, contacts, bodies, substep, longest, threshold]
     wp.launch(_watch, dim=dim, inputs=inputs, outputs=[overlaps], device=m.peaks.device)
 
@@ -245,11 +235,7 @@ def _watch_forces(m: Monitor, bodies: BodyView, gravity_in: wp.array[wp.vec3], l
 def watch_forces(m: Monitor, bodies: BodyView, gravity, longest: float):
     """Raise ``peaks`` by the displacement of bodies by forces within a substep, and mark the time of forces.
 
-    Args:
-        m: The monitor.
-        bodies: The bodies, with evaluated forces.
-        gravity: Gravity of each world [m/s²].
-        longest: Length of the substeps of the first level [s].
+    ``gravity`` [m/s²] has an entry for each world; ``longest`` is the length of the substeps of the first level [s].
     """
     inputs = [m, bodies, gravity, longest]
     wp.launch(_watch_forces, dim=max(len(m.thickness), 1), inputs=inputs, device=m.peaks.device)
@@ -268,11 +254,7 @@ def watch_flags(flags, index: int, counts):
 
 @wp.kernel
 def _watch_induction(
-    # inputs:
-    m: Monitor,
-    error_in: wp.array[wp.float64],
-    evaluations_in: wp.array[wp.int32],
-    converged_in: wp.array[wp.int32],
+    m: Monitor, error_in: wp.array[wp.float64], evaluations_in: wp.array[wp.int32], converged_in: wp.array[wp.int32]
 ):
     mark_time(m.ticks, INDUCTION)
     error = error_in[0]

@@ -11,59 +11,40 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class BodyView:
-    """Bodies of a model in one state, arrays of shape [bodies].
+    """Bodies of a model in one state, arrays of shape [bodies]."""
 
-    Attributes:
-        q: Pose.
-        qd: Velocity of the center of mass and angular velocity [m/s, rad/s].
-        f: Force and torque about the center of mass [N, N·m].
-        com: Center of mass in the body's frame [m].
-        inertia: Inertia in the body's frame [kg·m²].
-        inv_mass: Inverse mass, zero for bodies that forces do not move [1/kg].
-        inv_inertia: Inverse inertia in the body's frame [1/(kg·m²)].
-        flags: Newton's ``BodyFlags``.
-        world: World of the body.
-    """
-
-    q: wp.array[wp.transform]
-    qd: wp.array[wp.spatial_vector]
-    f: wp.array[wp.spatial_vector]
-    com: wp.array[wp.vec3]
-    inertia: wp.array[wp.mat33]
-    inv_mass: wp.array[float]
-    inv_inertia: wp.array[wp.mat33]
-    flags: wp.array[wp.int32]
-    world: wp.array[wp.int32]
+    q: wp.array[wp.transform]  # pose
+    qd: wp.array[wp.spatial_vector]  # velocity of the center of mass and angular velocity [m/s, rad/s]
+    f: wp.array[wp.spatial_vector]  # force and torque about the center of mass [N, N·m]
+    com: wp.array[wp.vec3]  # center of mass in the body's frame [m]
+    inertia: wp.array[wp.mat33]  # inertia in the body's frame [kg·m²]
+    inv_mass: wp.array[float]  # inverse mass, zero for bodies that forces do not move [1/kg]
+    inv_inertia: wp.array[wp.mat33]  # inverse inertia in the body's frame [1/(kg·m²)]
+    flags: wp.array[wp.int32]  # Newton's ``BodyFlags``
+    world: wp.array[wp.int32]  # world of the body
 
 
 @wp.struct
 class ContactView:
-    """Contacts of rigid bodies, and their shapes.
+    """Contacts of rigid bodies, and their shapes."""
 
-    Attributes:
-        count: Number of contacts, more than ``contact_max`` if some were dropped, shape [1].
-        shape0, shape1: Shapes of each contact, shape [contact_max].
-        point0, point1: Contact points in the frames of the two bodies [m], shape [contact_max].
-        offset0, offset1: Vectors from the contact points to the surfaces, in those frames [m], shape [contact_max].
-        margin0, margin1: Distance of the surface from each point [m], shape [contact_max].
-        normal: Unit vector from the first shape to the second, shape [contact_max].
-        shape_body: Body of each shape, -1 for the world, shape [shapes].
-        shape_gap: Distance up to which contacts are detected [m], shape [shapes].
-        mu, mu_torsional, mu_rolling: Coefficients of friction of each shape, shape [shapes].
-    """
-
-    count: wp.array[wp.int32]
+    count: wp.array[wp.int32]  # number of contacts, more than ``contact_max`` if some were dropped, shape [1]
+    # Shapes of each contact, shape [contact_max].
     shape0: wp.array[wp.int32]
     shape1: wp.array[wp.int32]
+    # Contact points in the frames of the two bodies [m], shape [contact_max].
     point0: wp.array[wp.vec3]
     point1: wp.array[wp.vec3]
+    # Vectors from the contact points to the surfaces, in those frames [m], shape [contact_max].
     offset0: wp.array[wp.vec3]
     offset1: wp.array[wp.vec3]
+    # Distance of the surface from each point [m], shape [contact_max].
     margin0: wp.array[float]
     margin1: wp.array[float]
-    normal: wp.array[wp.vec3]
-    shape_body: wp.array[wp.int32]
-    shape_gap: wp.array[float]
+    normal: wp.array[wp.vec3]  # unit vector from the first shape to the second, shape [contact_max]
+    shape_body: wp.array[wp.int32]  # body of each shape, -1 for the world, shape [shapes]
+    shape_gap: wp.array[float]  # distance up to which contacts are detected [m], shape [shapes]
+    # Coefficients of friction of each shape, shape [shapes].
     mu: wp.array[float]
     mu_torsional: wp.array[float]
     mu_rolling: wp.array[float]
@@ -89,6 +70,14 @@ def view_contacts(model, contacts) -> ContactView:
     for name in ("mu", "mu_torsional", "mu_rolling"):
         setattr(view, name, getattr(model, f"shape_material_{name}"))
     return view
+
+
+@wp.func
+def body_pose(body_q: wp.array[wp.transform], body: int) -> wp.transform:
+    """Return the pose of a body, the identity for the world, -1."""
+    if body < 0:
+        return wp.transform_identity()
+    return body_q[body]
 
 
 @wp.func

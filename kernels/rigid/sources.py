@@ -9,44 +9,38 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class SourceShapes:
-    """Shapes of s sources of fields, on b bodies.
+    """Shapes of s sources of fields, on b bodies."""
 
-    Attributes:
-        shape: Shape of each source, shape [s].
-        shape_body, shape_frames: Body of each shape, and its frame in that body's frame: arrays of the model, shape
-            [shapes].
-        strengths: Strength of each shape, an array of the model, shape [shapes].
-        body_list, run_start: Bodies with sources, and the first source of each in ``order``, shape [b] and [b + 1].
-        order: Sources sorted by body.
-        kinematic_flag: Newton's flag of bodies that forces do not move.
-    """
-
-    shape: wp.array[wp.int32]
+    shape: wp.array[wp.int32]  # shape of each source, shape [s]
+    # Body of each shape, and its frame in that body's frame: arrays of the model, shape [shapes].
     shape_body: wp.array[wp.int32]
     shape_frames: wp.array[wp.transform]
-    strengths: wp.array[float]
+    strengths: wp.array[float]  # strength of each shape, an array of the model, shape [shapes]
+    # Bodies with sources, and the first source of each in ``order``, shape [b] and [b + 1].
     body_list: wp.array[wp.int32]
     run_start: wp.array[wp.int32]
-    order: wp.array[wp.int32]
-    kinematic_flag: int
+    order: wp.array[wp.int32]  # sources sorted by body
+    kinematic_flag: int  # Newton's flag of bodies that forces do not move
+
+
+@wp.func
+def _world_frame(body_q: wp.array[wp.transform], body: int, frame: wp.transform) -> wp.transform:
+    """Return the frame of a shape in the world, from its frame in a body or in the world, -1."""
+    if body < 0:
+        return frame
+    return body_q[body] * frame
 
 
 @wp.kernel
 def _gather_sources(
-    # inputs:
     body_q_in: wp.array[wp.transform],
     sources: SourceShapes,
-    # outputs:
     frames_out: wp.array[wp.transform],
     strengths_out: wp.array[wp.vec3],
 ):
     s = wp.tid()
     shape = sources.shape[s]
-    frame = sources.shape_frames[shape]
-    body = sources.shape_body[shape]
-    if body >= 0:
-        frame = body_q_in[body] * frame
-    frames_out[s] = frame
+    frames_out[s] = _world_frame(body_q_in, sources.shape_body[shape], sources.shape_frames[shape])
     strengths_out[s] = wp.vec3(sources.strengths[shape], 0.0, 0.0)
 
 
@@ -58,12 +52,7 @@ def gather_sources(body_q, sources: SourceShapes, frames, strengths):
 
 @wp.kernel
 def _gather_source_motion(
-    # inputs:
-    bodies: BodyView,
-    sources: SourceShapes,
-    frames_in: wp.array[wp.transform],
-    # outputs:
-    motion_out: wp.array2d[float],
+    bodies: BodyView, sources: SourceShapes, frames_in: wp.array[wp.transform], motion_out: wp.array2d[float]
 ):
     s = wp.tid()
     body = sources.shape_body[sources.shape[s]]
@@ -84,12 +73,10 @@ def gather_source_motion(sources: SourceShapes, model, state, frames, motion):
 
 @wp.kernel
 def _add_reactions(
-    # inputs:
     sources: SourceShapes,
     bodies: BodyView,
     frames_in: wp.array[wp.transform],
     wrenches_in: wp.array2d[float],
-    # outputs:
     body_f_out: wp.array[wp.spatial_vector],
 ):
     k = wp.tid()
@@ -133,33 +120,24 @@ def set_strengths(values, shapes, strengths):
 
 @wp.struct
 class Sites:
-    """Sites of s sensors.
+    """Sites of s sensors."""
 
-    Attributes:
-        shape: Shape of each site, shape [s].
-        shape_body, shape_frames: Body of each shape, and its frame in that body's frame: arrays of the model, shape
-            [shapes].
-    """
-
-    shape: wp.array[wp.int32]
+    shape: wp.array[wp.int32]  # shape of each site, shape [s]
+    # Body of each shape, and its frame in that body's frame: arrays of the model, shape [shapes].
     shape_body: wp.array[wp.int32]
     shape_frames: wp.array[wp.transform]
 
 
 @wp.func
-def _frame_of(sites: Sites, body_q: wp.array[wp.transform], i: int) -> wp.transform:
+def _site_frame(sites: Sites, body_q: wp.array[wp.transform], i: int) -> wp.transform:
     shape = sites.shape[i]
-    frame = sites.shape_frames[shape]
-    body = sites.shape_body[shape]
-    if body >= 0:
-        frame = body_q[body] * frame
-    return frame
+    return _world_frame(body_q, sites.shape_body[shape], sites.shape_frames[shape])
 
 
 @wp.kernel
 def _find_sites(body_q_in: wp.array[wp.transform], sites: Sites, points_out: wp.array[wp.vec3]):
     i = wp.tid()
-    points_out[i] = wp.transform_get_translation(_frame_of(sites, body_q_in, i))
+    points_out[i] = wp.transform_get_translation(_site_frame(sites, body_q_in, i))
 
 
 def find_sites(body_q, sites: Sites, points):
@@ -169,7 +147,6 @@ def find_sites(body_q, sites: Sites, points):
 
 @wp.kernel
 def _read_sites(
-    # inputs:
     body_q_in: wp.array[wp.transform],
     sites: Sites,
     field_in: wp.array[wp.vec3],
@@ -177,11 +154,10 @@ def _read_sites(
     limit: float,
     seed: int,
     reading_count_in: wp.array[wp.int32],
-    # outputs:
     readings_out: wp.array[wp.vec3],
 ):
     i = wp.tid()
-    rotation = wp.transform_get_rotation(_frame_of(sites, body_q_in, i))
+    rotation = wp.transform_get_rotation(_site_frame(sites, body_q_in, i))
     reading = wp.quat_rotate_inv(rotation, field_in[i])
     random = wp.rand_init(seed, reading_count_in[0] * field_in.shape[0] + i)
     for c in range(3):
@@ -198,12 +174,9 @@ def read_sites(body_q, sites: Sites, field, *, noise: float, limit: float, seed:
     """Write the readings of a vector field by sensors at the sites.
 
     Args:
-        body_q: Poses of bodies.
-        sites: The sites.
         field: Field at the sites, world frame, shape [s].
         noise: Standard deviation of the noise of each component, in the unit of the field.
         limit: Largest magnitude of a component that a sensor reads; infinite for no limit.
-        seed: Seed of the noise.
         reading_count: In and out, number of previous readings, shape [1].
         readings: Out, in the frames of the sites, shape [s].
     """

@@ -42,7 +42,7 @@ STATUSES = 8
 
 RUNNING, OVERFLOW, NOT_FINITE, PAUSED = range(4)
 """Values of ``STATUS_HALT``; the host sets ``PAUSED``."""
-_CHUNK = 16
+_WORDS_PER_THREAD = 16
 """Words of a state that a thread copies."""
 
 LOG_SUBSTEPS, LOG_ATTEMPTS, LOG_CAPPED, LOG_REGROWN, LOG_EVALUATIONS, LOG_UNCONVERGED = range(6)
@@ -54,56 +54,34 @@ LOG_FIELDS = LOG_TICKS + STAGES
 
 @wp.struct
 class StepArrays:
-    """Arrays and limits of the state machine.
+    """Arrays and limits of the state machine."""
 
-    Attributes:
-        flags: Conditions of the loops around a step, see ``FLAG_*``.
-        status: Present state, see ``STATUS_*``.
-        peaks, counts: Arrays of the ``monitor``.
-        last_overlap: Deepest penetration over thickness, first of the last step, then of the last attempt at the
-            present step. The second number is infinite unless that attempt was rejected for its penetration.
-        ticks: Time of each stage since the last accepted step, then the clock at the last mark; nanoseconds on a GPU,
-            clock cycles on a CPU.
-        log: Ring buffer with a record of each step, see ``LOG_*``, shape [records, LOG_FIELDS].
-        capacities: Size of each monitored buffer.
-        travel: Limit of the motion in a substep over a body's thickness.
-        shared_travel: Limit of that motion while more than two substeps share forces.
-        overlap: Limit of a new penetration over the thickness of the thinner body.
-        growth_margin: Substeps double in length if the predicted motion stays below this fraction of ``travel``.
-        futile_ratio: Substeps are not shortened further if they leave more than this fraction of a penetration.
-        first_level_substeps: Substeps of a step at the first level, an even number.
-    """
-
-    flags: wp.array[wp.int32]
-    status: wp.array[wp.int32]
-    peaks: wp.array[float]
+    flags: wp.array[wp.int32]  # conditions of the loops around a step, see ``FLAG_*``
+    status: wp.array[wp.int32]  # present state, see ``STATUS_*``
+    peaks: wp.array[float]  # as in ``Monitor``, as are ``counts`` and ``ticks``
     counts: wp.array[wp.int32]
+    # Deepest penetration over thickness, first of the last step, then of the last attempt at the present step. The
+    # second number is infinite unless that attempt was rejected for its penetration.
     last_overlap: wp.array[float]
     ticks: wp.array[wp.uint64]
-    log: wp.array2d[wp.float64]
-    capacities: wp.array[wp.int32]
-    travel: float
-    shared_travel: float
-    overlap: float
-    growth_margin: float
-    futile_ratio: float
-    first_level_substeps: int
+    log: wp.array2d[wp.float64]  # ring buffer with a record of each step, see ``LOG_*``, shape [records, LOG_FIELDS]
+    capacities: wp.array[wp.int32]  # size of each monitored buffer
+    travel: float  # limit of the motion in a substep over a body's thickness
+    shared_travel: float  # limit of that motion while more than two substeps share forces
+    overlap: float  # limit of a new penetration over the thickness of the thinner body
+    growth_margin: float  # substeps double in length if the predicted motion stays below this fraction of ``travel``
+    futile_ratio: float  # substeps are not shortened further if they leave more than this fraction of a penetration
+    first_level_substeps: int  # substeps of a step at the first level, an even number
 
 
 @wp.struct
 class StateCopies:
-    """Addresses of the arrays of a state and of its copy.
+    """Addresses of the arrays of a state and of its copy."""
 
-    Attributes:
-        own, saved: Address of each array, shape [arrays].
-        sizes: Bytes of each array, shape [arrays].
-        ends: Cumulative number of whole words of the arrays, shape [arrays].
-    """
-
-    own: wp.array[wp.uint64]
-    saved: wp.array[wp.uint64]
-    sizes: wp.array[wp.int32]
-    ends: wp.array[wp.int32]
+    own: wp.array[wp.uint64]  # address of each array of the state, shape [arrays]
+    saved: wp.array[wp.uint64]  # address of each array of the copy, shape [arrays]
+    sizes: wp.array[wp.int32]  # bytes of each array, shape [arrays]
+    ends: wp.array[wp.int32]  # cumulative number of whole words of the arrays, shape [arrays]
 
 
 @wp.func
@@ -112,7 +90,7 @@ def _copy_chunk(chunk: int, copies: StateCopies, sources: wp.array[wp.uint64], t
     parts = copies.ends.shape[0]
     part = int(0)
     begin = int(0)
-    for i in range(chunk * _CHUNK, wp.min((chunk + 1) * _CHUNK, copies.ends[parts - 1])):
+    for i in range(chunk * _WORDS_PER_THREAD, wp.min((chunk + 1) * _WORDS_PER_THREAD, copies.ends[parts - 1])):
         while i >= copies.ends[part]:
             begin = copies.ends[part]
             part += 1
@@ -224,7 +202,7 @@ def _log_step(a: StepArrays, level: int):
 
 
 @wp.kernel
-def _judge(a: StepArrays):
+def _end_attempt(a: StepArrays):
     a.flags[FLAG_ATTEMPT] = 0
     a.flags[FLAG_REJECTED] = 1
     a.flags[FLAG_CONTACTS] = 1
@@ -288,14 +266,7 @@ class StepMachine:
     """
 
     def __init__(self, records: int, capacities: int, device, **limits: float):
-        """Allocate the arrays.
-
-        Args:
-            records: Capacity of the log, in steps.
-            capacities: Number of monitored buffers.
-            device: Warp device.
-            **limits: Limits of ``StepArrays``.
-        """
+        """Allocate a log of ``records`` steps and ``capacities`` counts; ``limits`` are those of ``StepArrays``."""
 
         def zeros(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
@@ -315,14 +286,10 @@ class StepMachine:
         self.invalidate_contacts()
 
     def make_monitor(self, thickness, reach) -> monitor.Monitor:
-        """Return the arrays of the monitor.
-
-        Args:
-            thickness, reach: Sizes of the bodies [m], see ``monitor``, shape [body_count].
-        """
+        """Return the arrays of the monitor, for bodies of these sizes [m], shape [body_count]."""
         a, m = self.arrays, monitor.Monitor()
         m.thickness, m.reach = (wp.array(values, dtype=float, device=a.status.device) for values in (thickness, reach))
-        m.fills = wp.zeros(len(a.capacities), dtype=wp.uint64, device=a.status.device)
+        m.fill_counts = wp.zeros(len(a.capacities), dtype=wp.uint64, device=a.status.device)
         m.level = a.status[STATUS_LEVEL : STATUS_LEVEL + 1]
         m.substeps = a.status[STATUS_SUBSTEPS : STATUS_SUBSTEPS + 1]
         m.ticks, m.peaks, m.counts = a.ticks, a.peaks, a.counts
@@ -340,17 +307,12 @@ class StepMachine:
         self._launch(_invalidate_contacts)
 
     def set_state_arrays(self, state: list, saved: list) -> None:
-        """Set the arrays of the state that steps save and restore, and their copies.
-
-        Args:
-            state: Contiguous arrays.
-            saved: Arrays of the same types and sizes.
-        """
+        """Set the contiguous arrays of the state that steps save and restore, and their copies."""
         device = self.arrays.status.device
         sizes = np.array([array.size * wp.types.type_size_in_bytes(array.dtype) for array in state], np.int32)
         ends = np.cumsum(sizes // 4, dtype=np.int32)
         self._arrays_alive = state, saved  # kernels hold only addresses
-        self._chunks = max(1, -(-int(ends[-1]) // _CHUNK))
+        self._chunks = max(1, -(-int(ends[-1]) // _WORDS_PER_THREAD))
         self._copies = copies = StateCopies()
         copies.own, copies.saved = (
             wp.array(np.array([array.ptr for array in arrays], np.uint64), device=device) for arrays in (state, saved)
@@ -368,10 +330,7 @@ class StepMachine:
     def write_time(self, step: float, longest: float, time) -> None:
         """Write the time at which the next two substeps begin [s] to ``time`` [1].
 
-        Args:
-            step: Length of a step [s].
-            longest: Length of the substeps of the first level [s].
-            time: Out.
+        ``step`` is the length of a step, ``longest`` that of the substeps of the first level [s].
         """
         self._launch(_write_time, wp.float64(step), wp.float64(longest), time)
 
@@ -379,6 +338,6 @@ class StepMachine:
         """Count two completed substeps of ``level``."""
         self._launch(_end_pair, level)
 
-    def judge(self) -> None:
+    def end_attempt(self) -> None:
         """Accept and log the last attempt, or begin another one, or halt."""
-        self._launch(_judge)
+        self._launch(_end_attempt)

@@ -29,8 +29,7 @@ def _own_quota() -> float:
 def cpu_quota(root: Path) -> float:
     """CPU time per real time that the cgroups of this process and their parents allow; infinite without a limit.
 
-    Args:
-        root: Root of the file system; ``proc/self/cgroup`` and ``proc/self/mountinfo`` in it are read.
+    ``proc/self/cgroup`` and ``proc/self/mountinfo`` below ``root`` are read.
     """
     try:
         groups = (root / "proc/self/cgroup").read_text().splitlines()

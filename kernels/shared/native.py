@@ -53,10 +53,7 @@ def native_kernel(call: str, header: str, arguments: dict, *, dtype, launch: dic
 def native_options(*headers: str, dtype, **constants: int | float) -> dict:
     """Module options of a kernel with ``module="unique"`` whose ``wp.func_native`` snippets call functions of headers.
 
-    Args:
-        headers: Paths from ``kernels/``.
-        dtype: Warp scalar type that ``Real`` is.
-        constants: Integers and reals that the headers use, by their names there.
+    Arguments are as in :func:`native_kernel`.
     """
     real = "float" if dtype is wp.float32 else "double"
     values = [

@@ -9,13 +9,7 @@ _BLOCK = 256
 
 
 @wp.kernel
-def _scan(
-    # inputs:
-    values_in: wp.array[wp.int32],
-    inclusive: int,
-    # outputs:
-    sums_out: wp.array[wp.int32],
-):
+def _scan(values_in: wp.array[wp.int32], inclusive: int, sums_out: wp.array[wp.int32]):
     """Scan the tiles one after the other in one block; loads beyond the end return zero, stores there do nothing."""
     before = int(0)
     for tile in range((values_in.shape[0] + _TILE - 1) // _TILE):
@@ -30,12 +24,9 @@ def _scan(
 
 
 def launch_scan(values, sums, inclusive: bool = True):
-    """Write the prefix sums of integers, as ``wp.utils.array_scan`` does.
+    """Write the prefix sums of integers, as ``wp.utils.array_scan`` does; ``sums`` may be ``values``.
 
-    Args:
-        values: Integers, shape [n].
-        sums: Out, sum of the values up to each element, shape [n]; may be ``values``.
-        inclusive: True if a value is part of its own sum.
+    A value is part of its own sum if ``inclusive``.
     """
     wp.launch_tiled(
         _scan, dim=1, inputs=[values, int(inclusive)], outputs=[sums], block_dim=_BLOCK, device=values.device

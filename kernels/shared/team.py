@@ -33,10 +33,7 @@ _GONE, _ASLEEP = 0, 2
 
 
 _start_members = native_kernel(
-    "start_members(count, team.data)",
-    "shared/team.h",
-    {"count": int, "team": wp.array2d[wp.uint64]},
-    dtype=wp.float32,
+    "start_members(count, team.data)", "shared/team.h", {"count": int, "team": wp.array2d[wp.uint64]}, dtype=wp.float32
 )
 
 
@@ -56,6 +53,17 @@ def team() -> wp.array:
         wp.launch(_start_members, dim=1, inputs=[count], outputs=[members], device="cpu")
         started[0] = count
     return members
+
+
+def launch_passes(kernel, first: int, last: int, arrays, *, device, threads: int, gpu_threads: int = 0, **options):
+    """Launch passes ``first`` to ``last`` − 1 of a kernel that takes ``native.PASS_ARGUMENTS`` and a struct of arrays.
+
+    One thread of Warp makes them on a CPU, where ``threads`` members of the team share the work. On a GPU there are
+    ``gpu_threads``. ``options`` are those of ``wp.launch``.
+    """
+    cuda = device.is_cuda
+    inputs = [first, last, threads, None if cuda else team(), arrays]
+    return wp.launch(kernel, dim=gpu_threads if cuda else 1, inputs=inputs, device=device, **options)
 
 
 @cache

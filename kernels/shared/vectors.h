@@ -56,30 +56,32 @@ CUDA_CALLABLE inline void put_vector(Real* rows, Vector v) {
 }
 
 // Loads and stores of public buffers, with a number or a vector (x, y, z) for each moment. At the end of a world fewer
-// moments are left than a vector has lanes: only the first ``held`` lanes are read and written, lane by lane.
+// moments are left than a vector has lanes: only the first ``lane_count`` lanes are read and written, lane by lane.
 #if defined(__CUDA_ARCH__)
-CUDA_CALLABLE inline Number numbers_or(const Real* row, int held, Real other) { return held > 0 ? *row : other; }
-CUDA_CALLABLE inline void put_first(Real* row, int held, Number n) {
-    if (held > 0) *row = n;
+CUDA_CALLABLE inline Number numbers_or(const Real* row, int lane_count, Real other) {
+    return lane_count > 0 ? *row : other;
 }
-CUDA_CALLABLE inline Vector vectors(const Real* rows, int held) {
-    return held > 0 ? Vector{rows[0], rows[1], rows[2]} : Vector{0, 0, 0};
+CUDA_CALLABLE inline void put_first(Real* row, int lane_count, Number n) {
+    if (lane_count > 0) *row = n;
 }
-CUDA_CALLABLE inline void put_vectors(Real* rows, int held, Vector v) {
-    if (held > 0) rows[0] = v.x, rows[1] = v.y, rows[2] = v.z;
+CUDA_CALLABLE inline Vector vectors(const Real* rows, int lane_count) {
+    return lane_count > 0 ? Vector{rows[0], rows[1], rows[2]} : Vector{0, 0, 0};
+}
+CUDA_CALLABLE inline void put_vectors(Real* rows, int lane_count, Vector v) {
+    if (lane_count > 0) rows[0] = v.x, rows[1] = v.y, rows[2] = v.z;
 }
 #else
-inline Number numbers_or(const Real* row, int held, Real other) {
+inline Number numbers_or(const Real* row, int lane_count, Real other) {
     Number n = other;
-    if (held >= WIDTH) __builtin_memcpy(&n, row, sizeof(n));
+    if (lane_count >= WIDTH) __builtin_memcpy(&n, row, sizeof(n));
     else
-        for (int l = 0; l < held; ++l) n[l] = row[l];
+        for (int l = 0; l < lane_count; ++l) n[l] = row[l];
     return n;
 }
-inline void put_first(Real* row, int held, Number n) {
-    if (held >= WIDTH) __builtin_memcpy(row, &n, sizeof(n));
+inline void put_first(Real* row, int lane_count, Number n) {
+    if (lane_count >= WIDTH) __builtin_memcpy(row, &n, sizeof(n));
     else
-        for (int l = 0; l < held; ++l) row[l] = n[l];
+        for (int l = 0; l < lane_count; ++l) row[l] = n[l];
 }
 
 // Component C of the vectors that are interleaved in (a, b, c).
@@ -97,26 +99,26 @@ template <int N, int... L> inline Number interleaved(Vector v, Sequence<int, L..
     return __builtin_shufflevector(low, v.z, ((F + L) % 3 == 2 ? WIDTH + (F + L) / 3 : L)...);
 }
 
-inline Vector vectors(const Real* rows, int held) {
+inline Vector vectors(const Real* rows, int lane_count) {
     Number a = 0, b = 0, c = 0;
-    if (held >= WIDTH) {
+    if (lane_count >= WIDTH) {
         const AllLanes all;
         __builtin_memcpy(&a, rows, sizeof(a));
         __builtin_memcpy(&b, rows + WIDTH, sizeof(b));
         __builtin_memcpy(&c, rows + 2 * WIDTH, sizeof(c));
         return {component<0>(a, b, c, all), component<1>(a, b, c, all), component<2>(a, b, c, all)};
     }
-    for (int l = 0; l < held; ++l) a[l] = rows[3 * l], b[l] = rows[3 * l + 1], c[l] = rows[3 * l + 2];
+    for (int l = 0; l < lane_count; ++l) a[l] = rows[3 * l], b[l] = rows[3 * l + 1], c[l] = rows[3 * l + 2];
     return {a, b, c};
 }
-inline void put_vectors(Real* rows, int held, Vector v) {
-    if (held >= WIDTH) {
+inline void put_vectors(Real* rows, int lane_count, Vector v) {
+    if (lane_count >= WIDTH) {
         const AllLanes all;
         const Number parts[3] = {interleaved<0>(v, all), interleaved<1>(v, all), interleaved<2>(v, all)};
         __builtin_memcpy(rows, parts, sizeof(parts));
         return;
     }
-    for (int l = 0; l < held; ++l) rows[3 * l] = v.x[l], rows[3 * l + 1] = v.y[l], rows[3 * l + 2] = v.z[l];
+    for (int l = 0; l < lane_count; ++l) rows[3 * l] = v.x[l], rows[3 * l + 1] = v.y[l], rows[3 * l + 2] = v.z[l];
 }
 #endif
 }

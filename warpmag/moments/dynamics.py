@@ -7,7 +7,7 @@
 * ``refine`` improves the moments by the field of their neighbors, before the whole field is summed,
 * ``iterate`` checks convergence in the summed field and takes one step.
 
-``carried`` returns the arrays that one solve passes to the next. All dynamics work on the state of a solve
+``persistent_arrays`` returns the arrays that one solve passes to the next. All dynamics work on the state of a solve
 (``kernels.induction.solve_state``), which holds the moments.
 """
 
@@ -34,9 +34,9 @@ class ThetaFlow:
         """Act on the moments of ``state``; ``responses`` are the bodies with a collective response."""
         self._state, self._responses = state, responses
 
-    def carried(self) -> dict:
+    def persistent_arrays(self) -> dict:
         """Return by name the arrays of the dynamics that a solve leaves for the next one."""
-        return {} if self._responses is None else self._responses.carried()
+        return {} if self._responses is None else self._responses.persistent_arrays()
 
     @cached_property
     def _launches(self) -> theta_flow.Launches:
@@ -74,7 +74,7 @@ class SubmagnetizationPairs:
         self._pairs = submagnetization.make_pairs(state, law, step, 1.0 / damping if law == "llg" else 0.0)
         self.first, self.second = self._pairs.first, self._pairs.second
 
-    def carried(self) -> dict:
+    def persistent_arrays(self) -> dict:
         """Return by name the arrays of the dynamics that a solve leaves for the next one."""
         return {"first": self.first, "second": self.second}
 

@@ -297,7 +297,7 @@ class MomentSystem:
         """Start the next solve from zero magnetization in every world."""
         self._induction.warm.zero_()
         if self._near is not None:
-            self._near.forget()
+            self._near.reset()
 
     def start_from(self, magnetizations):
         """Start the next solve from given magnetizations [A/m], a Warp array of vectors, shape [n]."""
@@ -320,14 +320,14 @@ class MomentSystem:
         aligned, ranges = self._rotatable.numpy() == 0, [(first, last) for first, _, last in self.world_ranges]
         self.eddy = EddyCurrents(self._packed, ranges, conductivity, aligned, self.material, step)
         if self.source_interaction is not None:
-            self.source_interaction.follow(self.eddy.motion)
+            self.source_interaction.enable_rates(self.eddy.motion)
 
-    def carried(self) -> dict[str, wp.array]:
+    def persistent_arrays(self) -> dict[str, wp.array]:
         """Return by name the arrays that one solve passes to the next. Restoring them repeats the next solve."""
-        parts = {"induction": solve_state.carried_arrays(self._induction), "pairs": self._packed.carried()}
-        parts["dynamics"] = self.dynamics.carried()
+        parts = {"induction": solve_state.persistent_arrays(self._induction), "pairs": self._packed.persistent_arrays()}
+        parts["dynamics"] = self.dynamics.persistent_arrays()
         if self._near is not None:
-            parts["near"] = self._near.carried()
+            parts["near"] = self._near.persistent_arrays()
         inner = {f"{part}.{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
         material = {"saturation": self.material.saturation, "slope": self.material.slope}
         return {"moments": self.moments, **material, **inner}

@@ -271,12 +271,12 @@ class Magnetics:
         magnet = replace(body_magnet.magnet, saturation=float(saturation), susceptibility=float(susceptibility))
         return replace(body_magnet, magnet=magnet)
 
-    def carried(self) -> dict[str, wp.array]:
+    def persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays that the next step depends on, by name: values set by the user and the last solution."""
         attributes, system = getattr(self._model, NAMESPACE), self.system
         values = {"magnetization": attributes.magnetization, "strength": attributes.strength}
         values["field"] = system.external_field
-        return values | self._values.carried() | system.carried()
+        return values | self._values.persistent_arrays() | system.persistent_arrays()
 
     def check_model(self) -> None:
         """Raise :class:`InputError` if ``model.warpmag`` was changed without a notification; waits for the device."""
@@ -446,7 +446,7 @@ class Magnetics:
         Returns:
             Total moment of each magnetic shape [A·m²], world frame, shape [n, 3].
         """
-        arrays = self.system.carried()
+        arrays = self.system.persistent_arrays()
         saved = take_snapshot(arrays)
         self.induce(state)
         moments = self.shape_moments().copy()

@@ -99,7 +99,7 @@ class ModelValues:
         )
         return saturation, susceptibility
 
-    def carried(self) -> dict[str, wp.array]:
+    def persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays of changeable attributes by name, for a checkpoint."""
         return {f"{when}.{name}": getattr(getattr(self, when), name) for when in ("now", "then") for name in _MATERIAL}
 

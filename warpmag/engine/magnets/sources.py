@@ -45,10 +45,10 @@ class ModelSources:
                 continue
             record = records.setdefault(texts[shape], SourceRecord.from_text(texts[shape]))
             body = int(bodies[shape])
-            pushed = body >= 0 and not flags.numpy()[body] & KINEMATIC
+            movable = body >= 0 and not flags.numpy()[body] & KINEMATIC
             kind = SourceKind[record.kind.upper()]
             self.shapes.append(shape)
-            self.applied.append(AppliedSource(kind, record.parameters, record.table, world, body, pushed))
+            self.applied.append(AppliedSource(kind, record.parameters, record.table, world, body, movable))
 
     def bind(self, system: MomentSystem) -> None:
         """Set the system, made with :attr:`applied`, that the other methods write to."""
@@ -57,14 +57,14 @@ class ModelSources:
         def on_device(values):
             return wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=model.device)
 
-        pushed = sorted((source.body, index) for index, source in enumerate(self.applied) if source.pushed)
-        bodies, starts = np.unique([body for body, _ in pushed], return_index=True)
+        movable = sorted((source.body, index) for index, source in enumerate(self.applied) if source.movable)
+        bodies, starts = np.unique([body for body, _ in movable], return_index=True)
         self._shapes = shapes = SourceShapes()
         shapes.shape = on_device(self.shapes)
         shapes.shape_body, shapes.shape_frames = model.shape_body, model.shape_transform
         shapes.strengths = getattr(model, NAMESPACE).strength
-        shapes.body_list, shapes.run_start = on_device(bodies), on_device([*starts, len(pushed)])
-        shapes.order = on_device([index for _, index in pushed])
+        shapes.body_list, shapes.run_start = on_device(bodies), on_device([*starts, len(movable)])
+        shapes.order = on_device([index for _, index in movable])
         shapes.kinematic_flag = KINEMATIC
 
     def gather(self, body_q) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.contacts.broad_phase import PARTNERS, allocate, launch_find_shape_pairs
-from warpmag.kernels.pairs.neighbors import carried_lists
+from warpmag.kernels.pairs.neighbors import persistent_lists
 from warpmag.kernels.rigid.newton_views import view_contacts
 
 _TYPES = (newton.GeoType.PLANE, newton.GeoType.SPHERE, newton.GeoType.CAPSULE, newton.GeoType.BOX)
@@ -70,12 +70,12 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
         if self._search is not None:
             self._search.arrays.body_qd, self._search.arrays.dt = state.body_qd, dt
 
-    def carried(self) -> dict[str, wp.array]:
+    def persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays that the next search depends on, by name."""
         if self._search is None:
             return {}
         lists = self._search.arrays.lists
-        return carried_lists(lists) | {"packed": lists.packed}
+        return persistent_lists(lists) | {"packed": lists.packed}
 
     def launch(self, shape_lower, shape_upper, shape_gap, shape_collision_group, shape_world, shape_count,
                candidate_pair, candidate_pair_count, **options) -> None:  # fmt: skip

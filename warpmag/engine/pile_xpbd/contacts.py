@@ -202,10 +202,10 @@ class RigidSolver:
             self._limits = new_limits
             self._allocate()
 
-    def carried(self) -> dict[str, wp.array]:
+    def persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays that the next substep depends on, by name."""
-        solver = self._solver.carried() if isinstance(self._solver, PileXPBD) else {}
-        return self._broad_phase.carried() | solver
+        solver = self._solver.persistent_arrays() if isinstance(self._solver, PileXPBD) else {}
+        return self._broad_phase.persistent_arrays() | solver
 
     def collide(self, state: newton.State, dt: float) -> None:
         """Find the contacts at ``state`` and the contacts expected within ``dt`` [s]; capturable in a graph."""

@@ -82,7 +82,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
         with self._splitting():
             super().step(state_in, state_out, control, contacts, dt, observables=observables)
 
-    def carried(self) -> dict[str, wp.array]:
+    def persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays that the next substep depends on, by name."""
         return {} if self._solve is None else self._solve.carried()
 

@@ -12,8 +12,8 @@ from warpmag.declarations.keys import Keys, SceneKeys
 from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.errors import InputError
-from warpmag.kernels.rigid.keyed_poses import launch_place, pose_bodies
-from warpmag.kernels.rigid.keys import follow, launch_follow
+from warpmag.kernels.rigid.keyed_poses import pose_bodies, write_keyed_poses
+from warpmag.kernels.rigid.keys import keyed_arrays, write_keyed_values
 from warpmag.moments.arrays import host_array
 
 
@@ -42,22 +42,22 @@ class KeyedModelValues:
         if keys.field is not None:
             self._field = wp.zeros(1, dtype=wp.vec3, device=model.device)
             curves, targets = [*curves, keys.field], [*targets, self._field]
-        self._followers = follow(curves, targets, self.time) if curves else None
+        self._keyed = keyed_arrays(curves, targets, self.time) if curves else None
 
     def set_values(self, offset: float, *, shared: wp.array | None = None, substep: float = 0.0) -> None:
         """Set magnetizations, currents and the field to their values ``offset`` [s] after :attr:`time`.
 
         ``shared`` is the number of substeps of ``substep`` [s] that share these values (``kernels.rigid.keys``).
         """
-        if self._followers is not None:
-            launch_follow(self._followers, offset, shared=shared, substep=substep)
+        if self._keyed is not None:
+            write_keyed_values(self._keyed, offset, shared=shared, substep=substep)
         if self._field is not None:
             self._magnetics.set_external_field(self._field)
 
     def pose_for_solver(self, state: newton.State, begin: float, dt: float) -> None:
         """Pose kinematic bodies for a substep of ``dt`` [s] that begins ``begin`` [s] after :attr:`time`."""
         if self._bodies is not None:
-            launch_place(self._bodies, state, begin, dt, at_end=self._contacts_at_end)
+            write_keyed_poses(self._bodies, state, begin, dt, at_end=self._contacts_at_end)
 
     def pose_for_contacts(self, state: newton.State, begin: float, horizon: float) -> None:
         """Pose kinematic bodies for the contact search ``begin`` [s] after :attr:`time`.
@@ -65,7 +65,7 @@ class KeyedModelValues:
         Their velocities are means over the next ``horizon`` [s].
         """
         if self._bodies is not None:
-            launch_place(self._bodies, state, begin, horizon, at_end=False)
+            write_keyed_poses(self._bodies, state, begin, horizon, at_end=False)
 
 
 class KeyedCurrents:
@@ -98,7 +98,9 @@ class KeyedCurrents:
             raise InputError("KeyedCurrents: no coil of the model has a current with time samples")
         self.shapes, strength = tuple(keys), getattr(model, NAMESPACE).strength
         self.time = wp.zeros(1, dtype=wp.float64, device=model.device)
-        self._followers = follow(list(keys.values()), [strength[shape : shape + 1] for shape in self.shapes], self.time)
+        self._keyed = keyed_arrays(
+            list(keys.values()), [strength[shape : shape + 1] for shape in self.shapes], self.time
+        )
         self.set()
 
     def set(self, time: float | None = None) -> None:
@@ -115,7 +117,7 @@ class KeyedCurrents:
             if seconds.size != 1:
                 raise InputError(f"time: must be one number, got {short_repr(time)}")
             self.time.fill_(float(seconds.reshape(-1)[0]))
-        launch_follow(self._followers, 0.0)
+        write_keyed_values(self._keyed, 0.0)
 
 
 def _free_joints(model: newton.Model, bodies: list[int]) -> list[int]:

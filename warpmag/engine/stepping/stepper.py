@@ -121,7 +121,7 @@ class Stepper:
     def _prepare(self) -> None:
         """Update the sizes of the solver's buffers, and discard the graph. The number of buffers is constant."""
         self._arrays.capacities.assign(np.array([buffer.limit for buffer in self._solver.buffers], np.int32))
-        self._watched.fills.assign(self._solver.fills())
+        self._watched.fill_counts.assign(self._solver.fills())
         self._machine.invalidate_contacts()
         self._graph, self._warm = None, False
 
@@ -249,21 +249,21 @@ class Stepper:
     def save(self) -> dict[str, np.ndarray]:
         """Return the arrays that the next step depends on, and may overwrite; call :meth:`read_reports` first."""
         numbers = {"steps": np.array(self.steps), "buffers": self._solver.limits()}
-        return numbers | snapshot_views(self._carried())
+        return numbers | snapshot_views(self._persistent_arrays())
 
     def load(self, saved: dict[str, np.ndarray]) -> None:
         """Continue from the arrays that :meth:`save` returned; another model's arrays raise :class:`InputError`."""
         self._solver.set_limits(saved["buffers"])
         self._prepare()
-        restore_snapshot(self._carried(), saved)
+        restore_snapshot(self._persistent_arrays(), saved)
         self.steps = self._reported = int(saved["steps"])
 
-    def _carried(self) -> dict[str, wp.array]:
+    def _persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays that the next step depends on, by name."""
         machine = {name: getattr(self._arrays, name) for name in ("status", "last_overlap")}
         parts = {"state": dict(enumerate(_arrays(self._state))), "machine": machine}
         parts["control"] = dict(enumerate(_arrays(self._control)))
-        parts |= {"magnetics": self._magnetics.carried(), "solver": self._solver.carried()}
+        parts |= {"magnetics": self._magnetics.persistent_arrays(), "solver": self._solver.persistent_arrays()}
         return {f"{part}.{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
 
     def measure_contacts(self, overlap_threshold: float) -> tuple[float, float, int]:
@@ -301,7 +301,7 @@ class Stepper:
         for level, remaining in enumerate(machine.remaining):
             wp.capture_while(remaining, self._advance_twice, level=level)
         self._find_first_contacts(substep=monitor.NEXT_SUBSTEP)
-        machine.judge()
+        machine.end_attempt()
         machine.restore()
 
     def _advance_twice(self, level: int) -> None:
