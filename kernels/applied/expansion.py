@@ -21,10 +21,8 @@ import numpy as np
 
 from warpmag.kernels.shared.native import CHUNK
 
-POINT_DEPTH = 0.4
-"""Distance of the points from the ball's center [radii]."""
-TENSOR_ROWS = 21
-"""Independent components of the tensors of degrees 2 to 4."""
+POINT_DEPTH = 0.4  # distance of the points from the ball's center [radii]
+TENSOR_ROWS = 21  # independent components of the tensors of degrees 2 to 4
 EXPANSION_ROWS = 4 * TENSOR_ROWS
 """Rows of an expansion: the components, then for each component its derivatives along x, y and z for the force."""
 _INDEPENDENT = {

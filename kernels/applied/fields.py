@@ -25,14 +25,12 @@ from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
-AT_TARGETS, AT_POINTS, AT_BALLS, REACT, ADD_UP = range(5)
-"""Passes; as in ``passes.h``."""
+AT_TARGETS, AT_POINTS, AT_BALLS, REACT, ADD_UP = range(5)  # passes; as in ``passes.h``
 _TARGETS_PER_THREAD, _BALLS_PER_THREAD = 500, 50
 """Fewest pairs of a source and a target, and fewest pairs of a source and a ball, per thread of a CPU."""
 _TARGETS_PER_ROW, _BALLS_PER_ROW, _MOST_ROWS = 256, 8, 64
 """Fewest targets and fewest balls in a row of a reaction, and most rows of a source."""
-_GROUP = 32
-"""Threads of a GPU that share a source, or a row of its reaction."""
+_GROUP = 32  # threads of a GPU that share a source, or a row of its reaction
 
 
 @cache
@@ -65,11 +63,11 @@ class AppliedField:
     balls: tuple = (0, 0.0, 0.0, 0)
     """Constants of ``balls.h``: 1 if fields are expanded about balls, range of fading, rows of the response."""
     rates: wp.array | None = None
-    """Rate of the field of other bodies' sources [A/(m·s)], shape [t]; None unless :meth:`follow` was called."""
+    """Rate of the field of other bodies' sources [A/(m·s)], shape [t]; None before :meth:`enable_rates`."""
 
     def __init__(self, sources: FieldSources, targets, worlds, base, *, points: bool):
         """Allocate the results."""
-        self.sources, self.count, self._points = sources, targets.count, points
+        self.sources, self.device, self.count, self._points = sources, sources.device, targets.count, points
         self.arrays = arrays = source_arrays_type(sources.dtype)()
         arrays.coils, arrays.solids, arrays.packed = sources.coil_arrays, sources.solid_arrays, sources.packed.packed
         arrays.targets.packed, arrays.targets.base = targets.packed, base
@@ -98,11 +96,6 @@ class AppliedField:
         world = worlds[starts[:, 0]].astype(int)
         targets.chunk = self._integers(np.concatenate([starts, sources.bodies_of(world)], axis=1), wp.vec4i)
         targets.lists = self._integers(np.stack([sources.lists[world], sources.lists[world + 1]], axis=1), wp.vec2i)
-
-    @property
-    def device(self):
-        """Device of the sources."""
-        return self.sources.device
 
     def run_passes(self, first: int, last: int, items: int, group: int, share: int):
         """Launch passes: on a GPU with ``group`` threads per item, on a CPU with ``share`` items per thread."""
@@ -187,8 +180,7 @@ class AppliedForces(AppliedField):
     """Forces and torques of sources on moments, and the reactions on sources.
 
     Args:
-        worlds: World of each moment, shape [n].
-        base: Field at moments that is added to [A/m], Warp array, shape [n].
+        sources, worlds, base: As of :class:`AppliedField`, whose targets are all moments.
         movable: True for moments whose force is computed, shape [n].
         balls: True for balls whose multipoles respond to the field, shape [n]; None without such balls.
         constants: First and last distance from a source [radii] over which the multipoles fade, and the number of rows

@@ -22,8 +22,7 @@ import numpy as np
 
 from warpmag.kernels.shared.native import CHUNK
 
-INTEGER_TABLES = ("shape", "begin", "body")
-"""Tables of integers; the others have the scalar type of the moments."""
+INTEGER_TABLES = ("shape", "begin", "body")  # tables of integers; the others have the scalar type of the moments
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ import warp as wp
 
 from warpmag.kernels.applied.solids import INTEGER_TABLES, tables_of
 
-PARAMETERS = 9
-"""Largest number of parameters of a source, in addition to its table."""
+PARAMETERS = 9  # largest number of parameters of a source, in addition to its table
 
 
 class SourceKind(IntEnum):
@@ -167,9 +166,7 @@ def source_arrays_type(dtype):
 class FieldSources:
     """Coils, field maps and permanent bodies on a device.
 
-    Args:
-        solids: Permanent bodies, ``SolidMagnet``, ordered by world.
-        bias: M_r/χ of moments that respond to fields [A/m], shape [n]; None without them.
+    ``solids`` are ordered by world. ``bias`` is M_r/χ of moments that respond to fields [A/m], shape [n].
 
     Attributes:
         applied, solids: The sources.

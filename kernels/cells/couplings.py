@@ -22,12 +22,9 @@ from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
-COMMON = 8
-"""Low-order fields that all cells of a body share: three uniform and five linear ones; as in ``couplings.h``."""
-HARDEN, TURN, SHARE, ADD = range(4)
-"""The passes, in order; as in ``couplings.h``."""
-_CELLS_PER_THREAD = 500
-"""Cells per thread of a CPU, at least."""
+COMMON = 8  # low-order fields that all cells of a body share: three uniform and five linear ones; as in ``couplings.h``
+HARDEN, TURN, SHARE, ADD = range(4)  # the passes, in order; as in ``couplings.h``
+_CELLS_PER_THREAD = 500  # cells per thread of a CPU, at least
 
 
 @cache
@@ -149,9 +146,8 @@ class CellCouplings:
             if id(coupling) not in first_rows:
                 first_rows[id(coupling)] = CHUNK * sum(len(slots) for slots, _, _ in tables)
                 tables.append(_table(coupling.start, coupling.other, coupling.tensor))
-                places.append(
-                    np.pad(coupling.scaled_positions.T, ((0, 0), (0, -len(coupling.scaled_positions) % CHUNK)))
-                )
+                positions = coupling.scaled_positions
+                places.append(np.pad(positions.T, ((0, 0), (0, -len(positions) % CHUNK))))
             count, row = len(coupling.start) - 1, CHUNK * len(chunks)
             self.rows[number] = row
             starts = range(0, count, CHUNK)

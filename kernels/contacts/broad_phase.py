@@ -27,21 +27,15 @@ from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
-_SKIN = 0.3
-"""Fraction of its radius that a ball may move before the neighbor lists are rebuilt."""
+_SKIN = 0.3  # fraction of its radius that a ball may move before the neighbor lists are rebuilt
 _LARGEST_LISTED_RADIUS = 2.0
 """Radius [median radii] beyond which a ball is compared with all targets, like other shapes: the largest radius in the
 neighbor lists sets the width of the search's cells."""
-_PADDING = 16
-"""Boxes that vectors may read after the last one."""
-_TARGETS_PER_THREAD = 120
-"""Fewest shapes per thread of a CPU."""
-_TARGETS_AT_ONCE = 64
-"""Targets in a chunk of a CPU thread."""
-_MOST_COMPARISONS = 2e7
-"""Comparisons with other shapes beyond which Newton's sort is faster."""
-_CONSTANT_LIMIT_SHAPES = 25_000
-"""Shapes beyond which the limit grows as N^(5/3), like the comparisons of Newton's sort."""
+_PADDING = 16  # boxes that vectors may read after the last one
+_TARGETS_PER_THREAD = 120  # fewest shapes per thread of a CPU
+_TARGETS_AT_ONCE = 64  # targets in a chunk of a CPU thread
+_MOST_COMPARISONS = 2e7  # comparisons with other shapes beyond which Newton's sort is faster
+_CONSTANT_LIMIT_SHAPES = 25_000  # shapes beyond which the limit grows as N^(5/3), like the comparisons of Newton's sort
 _OTHERS_FOR_A_WARP = 64
 """Fewest other shapes with which a warp of a GPU shares a target, instead of a smaller group of threads."""
 _BLOCK = 128
@@ -50,8 +44,7 @@ _RESULTS, _RESULT_SIZE = 16 * _TARGETS_AT_ONCE, 12
 _PACKED_ROWS = 5
 PARTNERS = ("plane", "ball", "capsule", "box")
 """Shapes whose contacts with balls are detected here, as in ``ball_contacts.h``."""
-_KINEMATIC = 2
-"""Newton's flag of bodies that forces do not move."""
+_KINEMATIC = 2  # Newton's flag of bodies that forces do not move
 _lists_type = neighbors.lists_type(wp.float32)
 
 

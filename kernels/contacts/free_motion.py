@@ -145,11 +145,8 @@ def _apply_corrections(
 def launch_apply_corrections(bodies: BodyView, deltas, inv_weights, dt: float, q, qd):
     """Write the poses and velocities after position corrections; as in Newton's kernel, without its rest threshold.
 
-    Args:
-        deltas: Corrections as impulses and angular impulses about the centers of mass [N·s, N·m·s], shape [bodies].
-        inv_weights: Divisor of the impulses of each body, shape [bodies], or None.
-        q: Out, poses, shape [bodies].
-        qd: Out, velocities, shape [bodies].
+    ``deltas`` are impulses and angular impulses about the centers of mass [N·s, N·m·s], shape [bodies], divided by
+    ``inv_weights`` unless None.
     """
     inputs = [bodies, deltas, inv_weights, dt]
     wp.launch(_apply_corrections, dim=len(deltas), inputs=inputs, outputs=[q, qd], device=deltas.device)

@@ -33,8 +33,7 @@ _RECOVERY_SPEED = wp.constant(RECOVERY_SPEED)
 _CLOSING_SPEED = wp.constant(2.0)
 """Limit of the speed at which joint ends that are apart close, and slides return into their limits [m/s]. Bodies keep
 that speed, and it would grow with shorter substeps if each closed the whole distance."""
-_RETURN_RATE = wp.constant(10.0)
-"""Limit of the angular speed at which hinges return into their limits [rad/s]."""
+_RETURN_RATE = wp.constant(10.0)  # limit of the angular speed at which hinges return into their limits [rad/s]
 
 
 @wp.struct
@@ -66,9 +65,7 @@ class JointView:
     row_is_angular: wp.array[wp.bool]  # true for a rotation, false for a slide, shape [rows]
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Geometry of joints
-# ---------------------------------------------------------------------------------------------------------------------
+# -------------------- Geometry of joints --------------------
 
 
 @wp.func
@@ -107,9 +104,7 @@ def _angle(joints: JointView, bodies: BodyView, joint: int, axis: wp.vec3) -> fl
     return angle - 2.0 * wp.static(math.pi) * wp.round(angle / wp.static(2.0 * math.pi))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Frames and limits that a substep can reach
-# ---------------------------------------------------------------------------------------------------------------------
+# -------------------- Frames and limits that a substep can reach --------------------
 
 
 @wp.func
@@ -178,9 +173,7 @@ def launch_prepare_joints(joints: JointView, bodies: BodyView, dt: float, frames
     wp.launch(_prepare_joints, dim=len(joints.parent), inputs=[joints, bodies, dt], outputs=outputs, device=axes.device)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Lever arms
-# ---------------------------------------------------------------------------------------------------------------------
+# -------------------- Lever arms --------------------
 
 
 @wp.kernel
@@ -220,9 +213,7 @@ def launch_correct_lever_arms(joints: JointView, bodies: BodyView, q_now, impuls
     wp.launch(_correct_lever_arms, dim=len(impulses), inputs=inputs, outputs=[impulses, deltas], device=deltas.device)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Drives
-# ---------------------------------------------------------------------------------------------------------------------
+# -------------------- Drives --------------------
 
 
 @wp.func
@@ -294,15 +285,12 @@ def launch_add_drives(joints: JointView, bodies: BodyView, targets, impulses, de
         impulses: In and out, accumulated impulses of the drives [N·s or N·m·s], shape [rows].
         deltas: In and out, sums of the iteration's impulses on each body, shape [bodies].
         relaxation: Fraction of each correction that is applied.
-        dt: Length of the substep [s].
     """
     inputs = [joints, bodies, *targets, relaxation, dt]
     wp.launch(_add_drives, dim=len(impulses), inputs=inputs, outputs=[impulses, deltas], device=deltas.device)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Penetration recovery of contacts, and the loop of iterations
-# ---------------------------------------------------------------------------------------------------------------------
+# -------------------- Penetration recovery of contacts, and the loop of iterations --------------------
 
 
 @wp.func
@@ -332,10 +320,7 @@ def _limit_recovery_speed(
 def launch_limit_recovery_speed(contacts: ContactView, bodies: BodyView, kinematic_flag: int, dt: float, margin):
     """Write margins with which Newton's kernel separates overlapping bodies at ``RECOVERY_SPEED`` at most.
 
-    Args:
-        bodies: The bodies at the start of the substep, but kinematic ones at its end.
-        dt: Length of the substep [s].
-        margin: Out, margins in place of ``contacts.margin0`` [m], shape [contact_max].
+    They take the place of ``contacts.margin0``. Bodies are at the start of the substep, but kinematic ones at its end.
     """
     inputs = [contacts, bodies, kinematic_flag, dt]
     wp.launch(_limit_recovery_speed, dim=len(margin), inputs=inputs, outputs=[margin], device=margin.device)

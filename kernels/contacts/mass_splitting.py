@@ -21,8 +21,7 @@ from warpmag.kernels.rigid.newton_views import BodyView, ContactView, contact_bo
 
 wp.set_module_options({"enable_backward": False})
 
-ENTRIES = 36
-"""Entries of G, of which those on and above the diagonal are used."""
+ENTRIES = 36  # entries of G, of which those on and above the diagonal are used
 _STABLE_RELAXATION = wp.constant(2.0 * (1.0 + MOMENTUM) / (1.0 + 2.0 * MOMENTUM))
 _TOUCHING_GAP = wp.constant(0.1)
 """Distance up to which open contacts count, relative to the sum of their shapes' contact gaps."""
@@ -179,7 +178,6 @@ def launch_find_shares(
         shares: Out, number of shares, at least 1, shape [bodies]. Only contacts count that are closed, nearly closed,
             or may close in the substep.
         relaxation: Fraction of its correction that each contact applies in an iteration.
-        dt: Length of the substep [s].
     """
     device = shares.device
     inputs = [contacts, bodies, splits, relaxation, dt]

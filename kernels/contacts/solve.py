@@ -32,15 +32,12 @@ are faster: Balls Up (1,500 sides) takes a third of a launch, Falling Magnet (10
 _WORLDS, _WORLD_GROUP, _WORLD_LINES = 16, 8, (32, 64, 128, 208)
 """Worlds beyond which each has a block of its own; threads that share a body there; and possible numbers of bodies in a
 block's shared memory."""
-_BLOCK, _WIDE_BLOCKS = 128, 64
-"""Threads of a block; and blocks for wide bodies, which a whole block shares."""
+_BLOCK, _WIDE_BLOCKS = 128, 64  # threads of a block; and blocks for wide bodies, which a whole block shares
 _WIDE = 16, 4, 64
 """A body is wide with more contacts than 16 + 4 for each thread of its group, 64 at most. A solve of Letters, with up
 to 140 contacts per body, takes 0.12 ms on an H200, and 0.14 ms without wide bodies, in groups of 32 threads."""
-_CONTACTS_PER_THREAD = 100
-"""Fewest contacts per thread of a CPU: an iteration over them takes 1 to 2 µs."""
-_ROUND = 1e-6
-"""Relative difference of inverse inertias up to which a body counts as round: float32 rounding."""
+_CONTACTS_PER_THREAD = 100  # fewest contacts per thread of a CPU: an iteration over them takes 1 to 2 µs
+_ROUND_TOLERANCE = 1e-6  # relative difference of inverse inertias up to which a body counts as round: float32 rounding
 _CONTACT_SIZE, _RETURN_SIZE, _IMPULSE_SIZE, _RECORD_SIZE, _KEPT_SIZE = 20, 8, 12, 8, 9
 """Numbers of a contact, its return velocity, its accumulated impulse, a record, and a kept slip; as in
 ``solve_arrays.h``."""
@@ -58,44 +55,15 @@ class SolveArrays:
     A side is a contact seen from one of its bodies. A line holds a body that takes part, at the length of a cache line;
     the last one is the world. P is c, padded to a multiple of CHUNK. A CPU holds contacts in vectors, seen from their
     second bodies, as [P / CHUNK, numbers, CHUNK]. A GPU holds both sides, ordered by body.
-
-    Attributes:
-        contact_max, body_count, line_count: c, b and l.
-        kinematic_flag: Newton's flag of kinematic bodies.
-        count, ...: Fields of :class:`ContactView` and :class:`BodyView`; ``qd`` is written.
-        shares: Number of shares that mass splitting divides each body into, shape [b]; none for whole bodies.
-        kept_range: First of the sides of each body in the last substep, and the one after the last, shape [b, 2].
-        kept_key: Shapes of these sides, shape [2P].
-        kept: Their slip [m, rad], and their point on the body of the first shape [m], shape [2P, 9].
-        totals: GPU: numbers of bodies and sides that take part, of immovable, wide and unsolved bodies, and 1 if a
-            contact has friction, shape [6]. Launches solve the bodies that a cluster leaves unsolved.
-        side_count, filled: Number of sides of each body, and (GPU) of those listed so far, shape [b].
-        slot: Line of each body, shape [b].
-        body: Body of each line, -1 for the world, shape [l].
-        range: First of the sides of a line's body, and the one after the last, shape [l, 2].
-        entry: GPU: side as twice its contact plus its end, by body, shape [2P]. CPU: contacts that take part.
-        key: GPU: shapes of each side, shape [2P].
-        other: GPU: line of the other body, then contact of each side, shape [2, 2c]. CPU: lines of the first and second
-            body, then their records, shape [P / CHUNK, 4, CHUNK].
-        quiet: CPU: 1 for each vector of contacts whose records are zero, shape [P / CHUNK].
-        wide: GPU: lines of wide bodies, shape [b].
-        world_first: First body of each world that has a block, and the one after the last, shape [worlds + 1].
-        motion, next_motion: Lines of velocities, inverse masses and inertias, before and (GPU) after an iteration,
-            shape [l, LINE].
-        pose: Lines of centers of mass and orientations before the substep, shape [l, LINE].
-        side: Contacts of ``contact_law.h``: on a GPU prepared, shape [2P, LINE]; on a CPU detected, then prepared.
-        return_velocity: Return velocity of each side, shape [2P, 8]; on a CPU first its slip.
-        impulse: Accumulated impulse of each side, shape [2P, 12].
-        record: CPU: impulse of an iteration on each side, by body, and one for the immovable bodies of each vector,
-            shape [2P + P / CHUNK, 8].
     """
 
     # sizes
+    # c, b and l.
     contact_max: int
     body_count: int
     line_count: int
-    kinematic_flag: int
-    # contacts, see ContactView
+    kinematic_flag: int  # Newton's flag of kinematic bodies
+    # contacts, as in ContactView
     count: wp.uint64
     shape0: wp.uint64
     shape1: wp.uint64
@@ -110,7 +78,7 @@ class SolveArrays:
     mu: wp.uint64
     mu_torsional: wp.uint64
     mu_rolling: wp.uint64
-    # bodies, see BodyView
+    # bodies, as in BodyView; ``qd`` is written
     flags: wp.uint64
     com: wp.uint64
     inv_mass: wp.uint64
@@ -118,73 +86,67 @@ class SolveArrays:
     q: wp.uint64
     qd: wp.uint64
     # work
-    shares: wp.uint64
+    shares: wp.uint64  # number of shares that mass splitting divides each body into, shape [b]; none for whole bodies
+    # GPU: numbers of bodies and sides that take part, of immovable, wide and unsolved bodies, and 1 if a contact has
+    # friction, shape [6]. Launches solve the bodies that a cluster leaves unsolved.
     totals: wp.uint64
+    # Number of sides of each body, and (GPU) of those listed so far, shape [b].
     side_count: wp.uint64
     filled: wp.uint64
-    slot: wp.uint64
-    body: wp.uint64
-    range: wp.uint64
-    entry: wp.uint64
+    slot: wp.uint64  # line of each body, shape [b]
+    body: wp.uint64  # body of each line, -1 for the world, shape [l]
+    range: wp.uint64  # first of the sides of a line's body, and the one after the last, shape [l, 2]
+    entry: wp.uint64  # GPU: side as twice its contact plus its end, by body, shape [2P]. CPU: contacts that take part
+    # GPU: line of the other body, then contact of each side, shape [2, 2c]. CPU: lines of the first and second body,
+    # then their records, shape [P / CHUNK, 4, CHUNK].
     other: wp.uint64
-    quiet: wp.uint64
-    wide: wp.uint64
-    world_first: wp.uint64
+    quiet: wp.uint64  # CPU: 1 for each vector of contacts whose records are zero, shape [P / CHUNK]
+    wide: wp.uint64  # GPU: lines of wide bodies, shape [b]
+    world_first: wp.uint64  # first body of each world that has a block, and the one after the last, shape [worlds + 1]
+    # First of the sides of each body in the last substep, and the one after the last, shape [b, 2].
     kept_range: wp.uint64
-    key: wp.uint64
-    kept_key: wp.uint64
+    key: wp.uint64  # GPU: shapes of each side, shape [2P]
+    kept_key: wp.uint64  # shapes of the kept sides, shape [2P]
+    # Lines of velocities, inverse masses and inertias, before and (GPU) after an iteration, shape [l, LINE].
     motion: wp.uint64
     next_motion: wp.uint64
-    pose: wp.uint64
+    pose: wp.uint64  # lines of centers of mass and orientations before the substep, shape [l, LINE]
+    # Contacts of ``contact_law.h``: on a GPU prepared, shape [2P, LINE]; on a CPU detected, then prepared.
     side: wp.uint64
-    return_velocity: wp.uint64
-    impulse: wp.uint64
+    return_velocity: wp.uint64  # return velocity of each side, shape [2P, 8]; on a CPU first its slip
+    impulse: wp.uint64  # accumulated impulse of each side, shape [2P, 12]
+    # CPU: impulse of an iteration on each side, by body, and one for the immovable bodies of each vector, shape [2P + P
+    # / CHUNK, 8].
     record: wp.uint64
-    kept: wp.uint64
+    kept: wp.uint64  # their slip [m, rad], and point on the body of the first shape [m], shape [2P, 9]
 
 
 @dataclass(frozen=True)
 class SolveBuffers:
-    """Buffers of the solver on a device.
+    """Buffers of the solver on a device."""
 
-    Attributes:
-        arrays: The :class:`SolveArrays` that kernels read.
-        work: The arrays that belong to the solver, by name; ``counters`` has ``totals``, ``side_count`` and ``filled``.
-        round: True if every body has the same inertia about all axes.
-        group: Threads of a GPU that share a body, 0 on a CPU.
-        cluster: Blocks of a GPU's cluster, which lists the contacts and solves small scenes; 0 for launches.
-        limit: Most threads of a CPU, or most sides that a cluster solves.
-        worlds: Worlds that have a block of a GPU each, 0 for none.
-        world_lines: Bodies that fit into such a block.
-    """
-
-    arrays: Any
+    arrays: Any  # the :class:`SolveArrays` that kernels read
+    # The arrays that belong to the solver, by name; ``counters`` has ``totals``, ``side_count`` and ``filled``.
     work: dict[str, wp.array]
-    round: bool
-    group: int
-    cluster: int
-    limit: int
-    worlds: int
-    world_lines: int
+    round: bool  # true if every body has the same inertia about all axes
+    group: int  # threads of a GPU that share a body, 0 on a CPU
+    cluster: int  # blocks of a GPU's cluster, which lists the contacts and solves small scenes; 0 for launches
+    limit: int  # most threads of a CPU, or most sides that a cluster solves
+    worlds: int  # worlds that have a block of a GPU each, 0 for none
+    world_lines: int  # bodies that fit into such a block
 
-    def carried(self) -> dict[str, wp.array]:
+    def persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays that a substep hands on to the next one, by name."""
         return {name: self.work[name] for name in ("kept_range", "kept_key", "kept")}
 
 
 def allocate(contact_max: int, bodies: BodyView, *, kinematic_flag: int) -> SolveBuffers:
-    """Return the buffers.
-
-    Args:
-        contact_max: Most contacts.
-        bodies: The bodies.
-        kinematic_flag: Newton's flag of kinematic bodies.
-    """
+    """Return the buffers for at most ``contact_max`` contacts; ``kinematic_flag`` is Newton's flag of such bodies."""
     device, inertia = bodies.inv_mass.device, bodies.inv_inertia.numpy()
     world_first, world_lines = _split_worlds(bodies)
     body_count = len(inertia)
     isotropic = inertia[:, 0, 0, None, None] * np.eye(3)
-    is_round = bool((np.abs(inertia - isotropic) <= _ROUND * isotropic.max((1, 2), keepdims=True)).all())
+    is_round = bool((np.abs(inertia - isotropic) <= _ROUND_TOLERANCE * isotropic.max((1, 2), keepdims=True)).all())
     group = _WORLD_GROUP if world_lines else next(group for most, group in _GROUPS if body_count <= most)
     small = contact_max <= _CLUSTER_CAPACITY and body_count <= _GROUPS[2][0] and not world_lines
     cluster = _most_blocks(device, is_round, group) if small else 0
@@ -195,16 +157,9 @@ def allocate(contact_max: int, bodies: BodyView, *, kinematic_flag: int) -> Solv
     work["world_first"] = wp.array(world_first, dtype=wp.int32, device=device)
     for name in work.keys() - {"counters"}:
         setattr(arrays, name, work[name].ptr or 0)
-    return SolveBuffers(
-        arrays,
-        work,
-        round=is_round,
-        group=0 if device.is_cpu else group,
-        cluster=cluster,
-        limit=threads_for(contact_max, 1) if device.is_cpu else _SIDES_PER_BLOCK * cluster,
-        worlds=len(world_first) - 1 if world_lines else 0,
-        world_lines=world_lines,
-    )
+    limit = threads_for(contact_max, 1) if device.is_cpu else _SIDES_PER_BLOCK * cluster
+    group, worlds = 0 if device.is_cpu else group, len(world_first) - 1 if world_lines else 0
+    return SolveBuffers(arrays, work, is_round, group, cluster, limit, worlds, world_lines)
 
 
 def _line_count(body_count: int) -> int:
@@ -285,8 +240,7 @@ _CONTACT_ARRAYS = (
     *("margin1", "mu", "mu_torsional", "mu_rolling"),
 )
 """Arrays of :class:`ContactView` that kernels read."""
-_BODY_ARRAYS = ("flags", "com", "inv_mass", "inv_inertia", "q", "qd")
-"""Arrays of :class:`BodyView` that kernels read."""
+_BODY_ARRAYS = ("flags", "com", "inv_mass", "inv_inertia", "q", "qd")  # arrays of :class:`BodyView` that kernels read
 _ARGUMENTS = {
     **{"arrays": SolveArrays, "number": int, "relaxation": float, "dt": float, "limit": int},
     "team": wp.array2d[wp.uint64],
@@ -345,17 +299,13 @@ def launch_solve_contacts(
     relaxation: float,
     dt: float,
 ):
-    """Change velocities so that bodies do not overlap at the end of a substep.
+    """Change velocities so that bodies do not overlap at the end of a substep of ``dt`` [s].
 
     Args:
-        buffers: Buffers of the solver.
-        contacts: The contacts.
         bodies: The bodies as contacts were detected, with their velocities without contacts; ``qd`` of bodies with
             contacts is changed.
         shares: Number of shares that mass splitting divides each body into, shape [bodies], or None for whole bodies.
-        iterations: Number of iterations.
         relaxation: Fraction of its correction that each contact applies in an iteration.
-        dt: Length of the substep [s].
     """
     a, counters, totals = buffers.arrays, buffers.work["counters"], buffers.work["totals"]
     device = counters.device

@@ -45,16 +45,12 @@ from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel, native_options
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
-_RATES, _FIELDS = range(2)
-"""The passes; as in ``rates.h``."""
-_FIELD_ROWS = 13
-"""Rows at a conductor: 4π times H, dH/dt and ∇H (xx, yy, zz, xy, yz, zx); the sources' part of K/|N|²."""
+_RATES, _FIELDS = range(2)  # the passes; as in ``rates.h``
+_FIELD_ROWS = 13  # rows at a conductor: 4π times H, dH/dt and ∇H (xx, yy, zz, xy, yz, zx); the sources' part of K/|N|²
 MOTION_ROWS = 8
 """Rows: velocity [m/s], angular velocity [rad/s] of a moment; 1/mass [1/kg], 1/inertia [1/(kg·m²)] of its body."""
-_GROUP = 32
-"""Threads of a GPU that share a ball."""
-_PAIRS_PER_THREAD = 10000
-"""Pairs per thread of a CPU, at least."""
+_GROUP = 32  # threads of a GPU that share a ball
+_PAIRS_PER_THREAD = 10000  # pairs per thread of a CPU, at least
 
 
 @cache
@@ -250,10 +246,7 @@ class EddyCurrents:
         setattr(self._arrays, name, wp.array(np.ascontiguousarray(values, np.int32), dtype=kind, device=self._device))
 
     def _lay_out(self, name: str, chunks: str, slots: str, balls, sources) -> np.ndarray:
-        """Store the balls of all worlds in chunks, with the range of their sources and the place of each ball.
-
-        Returns all balls.
-        """
+        """Store the balls of all worlds in chunks, with their sources and their places; return the balls."""
         empty = np.zeros(0, int)
         places, rows, ball_slots = [empty], [], [empty]
         for own, (begin, end) in zip(balls, sources, strict=True):

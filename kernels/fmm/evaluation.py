@@ -18,8 +18,7 @@ from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PITCH
 from warpmag.kernels.pairs.pair_law import WIDTHS, Quantity
 
-_SAMPLED = 256
-"""Moments at which the error of the field is measured."""
+_SAMPLED = 256  # moments at which the error of the field is measured
 
 
 class FmmSums:
@@ -39,13 +38,12 @@ class FmmSums:
         """Allocate the sums and the expansions."""
         self._first, self._shares = first, share_boxes(octree, ranks)
         self._leaves = octree.level_begin if self._shares is None else self._shares.leaves
-        counts = np.ones(octree.count, np.int32) if sources is None else sources.astype(np.int32)
-        self._sources = wp.array(counts, dtype=wp.int32, device=octree.device)
+        self._sources = None if sources is None else wp.array(sources, dtype=wp.bool, device=octree.device)
         self._quantity = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity
         self._octree = octree
         n, device, dtype = octree.count, octree.device, octree.sorted.dtype
         self._sums = wp.zeros((n, WIDTHS[quantity]), dtype=dtype, device=device)
-        self._moments = octree.sorted
+        self._moments, self._vectors = octree.sorted, (octree.packed[4:7], octree.sorted[4:7])
         self._effective = wp.zeros((3, (1 + -(-n // PITCH)) * PITCH), dtype=dtype, device=device)[:, :n]
         self._expansions = Expansions(octree, tables, self._quantity, self._moments, self._effective, self._sums)
         self._expansions.share(self._leaves, self._shares)
@@ -53,18 +51,15 @@ class FmmSums:
         self._events = [wp.Event(device) for _ in range(2)] if device.is_cuda else []
 
     def __call__(self, effective, target, partial):
-        """Launch the sums of the present moments, at their positions when the octree was built.
+        """Launch the sums of the present moments, at their positions when the octree was built, to ``partial``.
 
-        Args:
-            effective: Effective moments e [A·m²] of the force, shape [3, n].
-            target: Packed column of each target row.
-            partial: Out: sums of the target rows, shape [1, rows, 3 or 6].
+        The arguments are those of ``PairEvaluation``'s ``sums``.
         """
         octree, device, dtype = self._octree, self._octree.device, self._sums.dtype
-        inputs = [octree.packed, octree.packed_index, self._sources]
-        wp.launch(_moments_kernel(dtype), octree.count, inputs, [self._moments], device=device)
+        inputs = [self._vectors[0], octree.packed_index, self._sources]
+        wp.launch(_sort_kernel(dtype), (3, octree.count), inputs, [self._vectors[1]], device=device)
         if self._quantity != Quantity.FIELD:
-            inputs = [effective, octree.packed_index]
+            inputs = [effective, octree.packed_index, None]
             wp.launch(_sort_kernel(dtype), (3, octree.count), inputs, [self._effective], device=device)
         if self._shares is not None:
             self._shares.find()
@@ -95,25 +90,22 @@ class FmmSums:
 
 
 @cache
-def _moments_kernel(dtype):
-    @wp.kernel(module="unique", enable_backward=False)
-    def sort_moments(
-        packed: wp.array2d[dtype], packed_index: wp.array[int], is_source: wp.array[int], sorted_out: wp.array2d[dtype]
-    ):
-        i = wp.tid()
-        j = packed_index[i]
-        for c in range(4, 7):
-            sorted_out[c, i] = wp.where(is_source[j] == 1, packed[c, j], dtype(0.0))
-
-    return sort_moments
-
-
-@cache
 def _sort_kernel(dtype):
+    """Return the kernel that sorts vectors, and sets those of moments that are no sources to zero."""
+
     @wp.kernel(module="unique", enable_backward=False)
-    def sort_vectors(vectors: wp.array2d[dtype], packed_index: wp.array[int], sorted_out: wp.array2d[dtype]):
+    def sort_vectors(
+        vectors: wp.array2d[dtype],
+        packed_index: wp.array[int],
+        is_source: wp.array[wp.bool],
+        sorted_out: wp.array2d[dtype],
+    ):
         c, i = wp.tid()
-        sorted_out[c, i] = vectors[c, packed_index[i]]
+        value = vectors[c, packed_index[i]]
+        if is_source:
+            if not is_source[packed_index[i]]:
+                value = dtype(0.0)
+        sorted_out[c, i] = value
 
     return sort_vectors
 

@@ -16,14 +16,10 @@ from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.shared.native import native_kernel
 from warpmag.kernels.shared.team import team, threads_for
 
-_THREADS = 128
-"""Threads of a block; a block processes one box at a time."""
-_DOWNWARD_BLOCKS = 8
-"""Blocks per multiprocessor in the downward pass."""
-_BOXES_PER_THREAD = 64
-"""Boxes per thread of a CPU, at least."""
-TERMS = 5
-"""Terms of a multipole's coefficient; as in ``expansions.h``."""
+_THREADS = 128  # threads of a block; a block processes one box at a time
+_DOWNWARD_BLOCKS = 8  # blocks per multiprocessor in the downward pass
+_BOXES_PER_THREAD = 64  # boxes per thread of a CPU, at least
+TERMS = 5  # terms of a multipole's coefficient; as in ``expansions.h``
 
 
 class _Step(IntEnum):

@@ -13,12 +13,9 @@ from warpmag.kernels.pairs.work_list import tile_size
 from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
-_LEAVES_PER_THREAD = 16
-"""Leaves per thread of a CPU, at least."""
-_WARPS = 4
-"""Warps of a block; each warp sums one leaf."""
-_TARGETS_PER_LANE = 4
-"""Most targets of a lane, 2 or 4."""
+_LEAVES_PER_THREAD = 16  # leaves per thread of a CPU, at least
+_WARPS = 4  # warps of a block; each warp sums one leaf
+_TARGETS_PER_LANE = 4  # most targets of a lane, 2 or 4
 _BLOCKS = {
     2: {Quantity.FIELD: 6, Quantity.FORCE: 5, Quantity.WRENCH: 4},
     4: {Quantity.FIELD: 4, Quantity.FORCE: 3, Quantity.WRENCH: 2},
@@ -50,11 +47,9 @@ def launch_near_sums(quantity: Quantity, moments, effective, neighbors, moment_b
 
     Args:
         quantity: ``FIELD``, ``FORCE`` or ``WRENCH``.
-        moments: Packed moments sorted by leaf, and leaves by world, z, y and x, shape [8, n], with the pitch of
-            ``packing``.
+        moments: Packed moments in the octree's order, shape [8, n], with the pitch of ``packing``.
         effective: Effective moments e [A·m²] of the force, in the same order, shape [3, n].
-        neighbors: Leaf at each offset x + 3 y + 9 z, itself in the middle, −1 for none, shape [boxes, 27].
-        moment_begin: First column of each leaf, and the end after the last, shape [boxes + 1] or more.
+        neighbors, moment_begin: Leaves, as in ``octree``.
         leaves: Range of leaves whose moments are targets, shape [2].
         sums: Out: 4π times force sum and field of each sorted moment, shape [n, 3 or 6].
     """

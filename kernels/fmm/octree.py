@@ -17,8 +17,7 @@ from warpmag.kernels.pairs.packing import PACKED_ROWS, PITCH
 from warpmag.kernels.shared.native import native_kernel
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
 
-_BLOCK = 256
-"""Moments of a thread block; as in ``octree.h``."""
+_BLOCK = 256  # moments of a thread block; as in ``octree.h``
 _MAX_LEVELS = 14
 """Most levels below the cube. Keys of boxes and moments are then sorted in six passes of 8 bits: after an odd number of
 passes Warp would copy the results."""
@@ -32,8 +31,7 @@ class _Pass(IntEnum):
     BOUND, KEYS, COUNT, WRITE, INVERT, LINK, PLACE = range(7)
 
 
-_BLOCK_PASSES = (_Pass.BOUND, _Pass.COUNT, _Pass.WRITE)
-"""Passes that take a block of moments at a time."""
+_BLOCK_PASSES = (_Pass.BOUND, _Pass.COUNT, _Pass.WRITE)  # passes that take a block of moments at a time
 
 
 @cache

@@ -28,8 +28,7 @@ class BoxShares:
 
     Attributes:
         leaves: Range of this process's leaves, shape [2].
-        order: This process's boxes sorted by height and octant.
-        octant_begin: Range of each height and octant in ``order``, shape [levels, 9].
+        order, octant_begin: This process's boxes, as in ``octree``.
     """
 
     def __init__(self, octree: Octree, ranks):

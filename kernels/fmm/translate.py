@@ -12,14 +12,10 @@ import warp as wp
 from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
-_BOXES_PER_THREAD = 64
-"""Boxes per thread of a CPU, at least."""
-_WARPS_TOGETHER = 12
-"""Warps per multiprocessor in float32, limited by registers."""
-_BOXES = 32
-"""Boxes per block of a GPU."""
-_GROUP_ROWS = 8
-"""Row slots per thread of a GPU."""
+_BOXES_PER_THREAD = 64  # boxes per thread of a CPU, at least
+_WARPS_TOGETHER = 12  # warps per multiprocessor in float32, limited by registers
+_BOXES = 32  # boxes per block of a GPU
+_GROUP_ROWS = 8  # row slots per thread of a GPU
 _MOST_SPLIT = 8192
 """Most boxes for which several blocks of a GPU share the displacements of a box. Few boxes do not fill the GPU."""
 OCTANTS = 8
@@ -64,9 +60,7 @@ def _arrays_type(dtype):
 class Translation:
     """Translation of multipoles of one degree: its matrices on a device, and its launch.
 
-    Args:
-        matrices: Matrix of each displacement, rows are harmonics of the target, shape [56, K, K].
-        parity: Signs ±1 of the harmonics under reflections of x, y and z, shape [3, K].
+    The arguments are ``multipole_to_local`` and ``parity`` of ``expansions.ExpansionTables``.
     """
 
     def __init__(self, matrices, parity, dtype, device):
@@ -113,11 +107,7 @@ class Translation:
         Args:
             multipoles: Multipoles of c boxes, then a row of zeros, shape [c + 1, pitch].
             local: Out: local expansions of the boxes in ``order``, shape [c + 1, pitch].
-            neighbors: Box at each offset x + 3 y + 9 z, −1 for none, shape [c, 27].
-            children: Child in each octant x + 2 y + 4 z, −1 for none, shape [c, 8].
-            parent: Parent of each box, −1 for none, shape [c].
-            order: Boxes sorted by level and octant.
-            octant_begin: Range of each level and octant in ``order``, shape [levels, 9].
+            neighbors, children, parent, order, octant_begin: Boxes, as in ``octree``.
             parts: Buffers from :meth:`parts` for these local expansions.
         """
         a = _arrays_type(self._dtype)()

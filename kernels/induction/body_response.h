@@ -147,13 +147,13 @@ CUDA_CALLABLE inline void newton_step(const InducibleBody& body, Cell* cells) {
             square = wide_dot(cell.residual, cell.residual);
             curvature = wide_dot(cell.residual, cell.residual - weighted(cell, cell.field));
         });
-        const double kept = step > 0 ? sums.first / before : 0;
-        const double curvature = sums.second - (step > 0 ? kept * sums.first / length_before : 0);
+        const double beta = step > 0 ? sums.first / before : 0;
+        const double curvature = sums.second - (step > 0 ? beta * sums.first / length_before : 0);
         if (!(curvature > 0)) break;
         const double length = sums.first / curvature;
         for_cells(body, cells, [&](Cell& cell) {
-            cell.direction = cell.residual + (Real)kept * cell.direction;
-            cell.along_direction = cell.field + (Real)kept * cell.along_direction;
+            cell.direction = cell.residual + (Real)beta * cell.direction;
+            cell.along_direction = cell.field + (Real)beta * cell.along_direction;
             cell.correction += (Real)length * cell.along_direction;
             const Vector change = cell.direction - weighted(cell, cell.along_direction);
             cell.residual -= (Real)length * change;

@@ -38,10 +38,8 @@ from warpmag.kernels.shared.team import team, threads_for
 
 MOST_CELLS = 64
 """Most cells of a body with a collective response: work grows as the square, and a GPU's block has few threads."""
-_GROUP = 4
-"""Threads of a GPU that share a cell."""
-_BODIES_PER_THREAD = 8
-"""Fewest bodies per thread of a CPU."""
+_GROUP = 4  # threads of a GPU that share a cell
+_BODIES_PER_THREAD = 8  # fewest bodies per thread of a CPU
 
 
 @dataclass(frozen=True)
@@ -110,9 +108,7 @@ class BodyResponses:
     def __init__(self, state, bodies: list[RespondingBody], cells):
         """Copy the tables to the device, and mark the cells in the state of the solve.
 
-        Args:
-            bodies: The bodies; bodies with the same ``tensors`` object share a table.
-            cells: The couplings of the bodies' cells (``CellCouplings``).
+        Bodies with the same ``tensors`` object share a table. ``cells`` are their ``CellCouplings``.
         """
         dtype, device = state.packed.dtype, state.h.device
         self._bodies = b = responses_type(dtype)()

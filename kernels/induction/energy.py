@@ -28,11 +28,7 @@ def _energy_kernel(dtype):
 
     @wp.func
     def product(a: vec3, b: vec3):
-        return (
-            wp.float64(a[0]) * wp.float64(b[0])
-            + wp.float64(a[1]) * wp.float64(b[1])
-            + wp.float64(a[2]) * wp.float64(b[2])
-        )
+        return wp.dot(wp.vec3d(a), wp.vec3d(b))
 
     @wp.kernel(module="unique", enable_backward=False, module_options=native_options("material/curves.h", dtype=dtype))
     def energy(
@@ -64,13 +60,10 @@ def _energy_kernel(dtype):
 
 
 def launch_energy(radii, moments, material, h, h0, h_permanent, external_field, energies):
-    """Launch each moment's share of the energy [J].
+    """Write each moment's share of the energy [J], float64, shape [n].
 
-    Args:
-        material: Materials of the moments (``curves.CurveParameters``).
-        h, h0: Total and applied field at the inducible moments [A/m], shape [n].
-        h_permanent: Field of other permanent moments at permanent moments [A/m], shape [n].
-        energies: Out: energies, float64, shape [n].
+    ``h`` and ``h0`` are the total and the applied field at inducible moments [A/m]. ``h_permanent`` is the field of
+    other permanent moments at permanent moments.
     """
     inputs = [material.inducible, radii, moments, material.saturation, material.slope, material.curve, material.tables]
     inputs += [h, h0, h_permanent, external_field]

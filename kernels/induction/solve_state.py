@@ -13,12 +13,9 @@ from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.shared.native import CHUNK, LINE
 from warpmag.kernels.shared.reductions import block_max, block_sum, fence
 
-DEPTH = 5
-"""Changes between iterates that are stored and mixed (``anderson.h``)."""
-COLUMNS = 7 + DEPTH + DEPTH * (DEPTH + 1) // 2
-"""Sums over the moments of a chunk or world; as in ``theta_step.h``."""
-BLOCK_CHUNK = 128
-"""Moments in a chunk on a GPU, one per thread of a block; on a CPU a chunk has ``native.CHUNK``."""
+DEPTH = 5  # changes between iterates that are stored and mixed (``anderson.h``)
+COLUMNS = 7 + DEPTH + DEPTH * (DEPTH + 1) // 2  # sums over the moments of a chunk or world; as in ``theta_step.h``
+BLOCK_CHUNK = 128  # moments in a chunk on a GPU, one per thread of a block; on a CPU a chunk has ``native.CHUNK``
 
 
 @wp.struct
@@ -40,8 +37,7 @@ class World:
     best: wp.float64  # smallest merit of this solve, negative before the first evaluation
     alpha: wp.types.vector(DEPTH, wp.float64)  # Anderson coefficients
     slowness: wp.float64  # predicted sum of the remaining steps over the last step
-    # Size of each stored change of the iterate over that of its residual, by slot.
-    gain: wp.types.vector(DEPTH, wp.float64)
+    gain: wp.types.vector(DEPTH, wp.float64)  # size of each stored change of the iterate over that of its residual
 
 
 @cache
@@ -51,16 +47,15 @@ def state_type(dtype):
 
     @wp.struct
     class SolveState:
-        # Moments, packed and plain [A·m²], shapes [8, n] and [n]; inducible ones are written.
-        packed: wp.array2d[dtype]
-        moments: wp.array[vec3]
-        # Lists of neighbors (``PackedMoments``).
+        packed: wp.array2d[dtype]  # moments, shape [8, n]; inducible ones are written
+        moments: wp.array[vec3]  # the same [A·m²], shape [n]
+        # Lists of neighbors (``PackedMoments``):
         neighbor: wp.array2d[int]
         neighbor_count: wp.array[int]
         overlap: wp.array2d[int]
         overlap_count: wp.array[int]
         searching: wp.array[int]
-        # Materials (``curves.CurveParameters``).
+        # Materials (``curves.CurveParameters``):
         saturation: wp.array[dtype]
         slope: wp.array[dtype]
         curve: wp.array[int]
@@ -69,8 +64,7 @@ def state_type(dtype):
         responds: wp.array[int]  # 1 for cells of bodies with a collective response (``body_response``), shape [n]
         rtol: wp.float64  # error at which a world ends
         max_evaluations: int  # field evaluations after which a world ends unconverged
-        # Moment, world, and range of the world's inducible moments, for each inducible moment, shape [m].
-        row: wp.array[wp.vec4i]
+        row: wp.array[wp.vec4i]  # moment, world, and range of the world's inducible moments, shape [m]
         chunk: wp.array[wp.vec3i]  # range of rows, and world, of each chunk, shape [c]
         chunk_begin: wp.array[int]  # first chunk of each world, shape [w + 1]
         near: wp.array3d[int]  # on a CPU rows of the neighbors of a chunk's moments, shape [c, CAPACITY, CHUNK]
@@ -78,39 +72,28 @@ def state_type(dtype):
         h0: wp.array[vec3]  # applied field [A/m], external and of permanent magnets, shape [n]
         h: wp.array[vec3]  # total field [A/m], shape [n]
         s: wp.array[vec3]  # dual variable [dimensionless], shape [n]
-        # Last iterate, and its residual, shape [n].
-        iterate_s: wp.array[vec3]
-        iterate_r: wp.array[vec3]
-        # Last changes of both from one evaluation to the next, shape [DEPTH, n].
-        history_s: wp.array2d[vec3]
+        iterate_s: wp.array[vec3]  # last iterate, shape [n]
+        iterate_r: wp.array[vec3]  # its residual
+        history_s: wp.array2d[vec3]  # last changes of both from one evaluation to the next, shape [DEPTH, n]
         history_r: wp.array2d[vec3]
-        # Iterate of the smallest merit, and its residual, shape [n].
-        best_s: wp.array[vec3]
-        best_r: wp.array[vec3]
-        # Reduced field of the mixed iterate, without the changes that the sweeps add, shape [n].
-        mixed_g: wp.array[vec3]
+        best_s: wp.array[vec3]  # iterate of the smallest merit, shape [n]
+        best_r: wp.array[vec3]  # its residual
+        mixed_g: wp.array[vec3]  # reduced field of the mixed iterate, without the changes by sweeps, shape [n]
         mixed_moment: wp.array[vec3]  # moments of the mixed iterate [A·m²], shape [n]
-        # Field of the inducible moments at the last two solutions [A/m], and the reduced total field; the last first,
-        # shape [2, n].
-        past_field: wp.array2d[vec3]
-        past_g: wp.array2d[vec3]
+        past_field: wp.array2d[vec3]  # inducible moments' field at the last two solutions [A/m], last first, [2, n]
+        past_g: wp.array2d[vec3]  # reduced total field at these solutions
         step: wp.array[dtype]  # step length of each moment, shape [n]
-        # Position [m], radius and moment [A·m²] of each row at these solutions, shape [rows, LINE].
-        past: wp.array2d[dtype]
-        # Position [m], radius, and change of moment by a step or by the first sweep, shape [rows, LINE].
-        now: wp.array2d[dtype]
-        swept: wp.array2d[dtype]
+        past: wp.array2d[dtype]  # position [m], radius and moment [A·m²] at these solutions, shape [rows, LINE]
+        now: wp.array2d[dtype]  # position [m], radius, and change of moment by a step, shape [rows, LINE]
+        swept: wp.array2d[dtype]  # the same, with the change by the first sweep
         sums: wp.array2d[wp.float64]  # sums of each chunk, on a CPU of each vector, shape [c, COLUMNS]
         arrived: wp.array[int]  # number of each world's chunks whose sums are complete, shape [w]
         worlds: wp.array[World]  # state of each world, shape [w]
         warm: wp.array[int]  # number of solves of each world since its cold start, at most ``STEADY``, shape [w]
-        # Relative residual ‖M − f(H)‖/‖f(H)‖ of each world after its last evaluation, shape [w].
-        residual: wp.array[wp.float64]
-        # Relative error of each world: the estimate of ``theta_flow``, or the residual of a baseline, shape [w].
-        error: wp.array[wp.float64]
-        # Number of evaluations of the last solve, and 1 if it converged, shape [w].
-        evaluations: wp.array[int]
-        converged: wp.array[int]
+        residual: wp.array[wp.float64]  # ‖M − f(H)‖/‖f(H)‖ of each world after its last evaluation, shape [w]
+        error: wp.array[wp.float64]  # estimate of ``theta_flow``, or residual of a baseline, relative, shape [w]
+        evaluations: wp.array[int]  # number of evaluations of the last solve, shape [w]
+        converged: wp.array[int]  # 1 if it converged, shape [w]
         condition: wp.array[int]  # 1 while any world iterates, shape [1]
 
     return SolveState
@@ -119,9 +102,7 @@ def state_type(dtype):
 def allocate(worlds, inducible, dtype, device):
     """Allocate the state of a solve; :func:`bind` sets the arrays that it shares.
 
-    Args:
-        worlds: World of each moment, non-decreasing, shape [n].
-        inducible: True for inducible moments, shape [n]; in each world inducible moments come first.
+    The worlds of the moments do not decrease. In each world inducible moments come first.
     """
     n, world_count = len(worlds), int(worlds[-1]) + 1 if len(worlds) else 0
     on_cpu = wp.get_device(device).is_cpu
@@ -175,14 +156,7 @@ def persistent_arrays(state) -> dict:
 
 
 def bind(state, packed, material, moments, rtol: float, max_evaluations: int) -> None:
-    """Set the moments of a solve, and the limits at which it ends.
-
-    Args:
-        material: Materials of the moments (``curves.CurveParameters``).
-        moments: Moments [A·m²], shape [n].
-        rtol: Error at which a world ends.
-        max_evaluations: Field evaluations after which a world ends unconverged.
-    """
+    """Set the moments of a solve with their materials, and the limits at which it ends."""
     state.packed, state.moments, state.searching = packed.packed, moments, packed.searching
     state.neighbor, state.neighbor_count = packed.neighbors, packed.neighbor_counts
     state.overlap, state.overlap_count = packed.overlaps, packed.overlap_counts

@@ -35,11 +35,6 @@ THETA_EULER, LLG, LLG_DAMPING = 0, 1, 2
 LAW_IDS = {"theta-euler": THETA_EULER, "llg": LLG, "llg-damping": LLG_DAMPING}
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# One step of one submagnetization
-# ---------------------------------------------------------------------------------------------------------------------
-
-
 @wp.func
 def effective_field(h: Any, m: Any, slope: Any, curve: int, tables: Any):
     """Return the reduced effective field H_eff/Ms (Eqs. 5, 11) of reduced field ``h`` and magnetization ``m``."""
@@ -92,11 +87,6 @@ def step_submagnetization(u: Any, h_eff: Any, kappa: Any, precession: Any, side:
     return wp.normalize(llg_step(u, h_eff, kappa, precession))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Kernels
-# ---------------------------------------------------------------------------------------------------------------------
-
-
 def _options(dtype) -> dict:
     return native_options("induction/solve_state.h", "material/curves.h", dtype=dtype)
 
@@ -108,8 +98,6 @@ def pairs_type(dtype):
 
     @wp.struct
     class Pairs:
-        """Pairs of submagnetizations, and parameters of their dynamics."""
-
         first: wp.array[vec3]  # directions M1/Ms, shape [n]
         second: wp.array[vec3]  # directions M2/Ms, shape [n]
         law: int  # ``THETA_EULER``, ``LLG`` or ``LLG_DAMPING``
@@ -231,11 +219,6 @@ def _step_kernel(dtype):
     return step_pairs
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Launches
-# ---------------------------------------------------------------------------------------------------------------------
-
-
 def make_pairs(state, law: str, kappa: float, precession: float):
     """Return pairs for the moments of ``state``, with dynamics ``law`` of ``LAW_IDS``."""
     dtype = state.packed.dtype
@@ -264,5 +247,5 @@ def launch_iteration(state, pairs):
     """Launch the check of convergence in the field ``state.h``, and a step of the pairs of worlds that iterate on."""
     state.condition.zero_()  # set again by any world that needs another evaluation
     kernel, chunks = _convergence_kernel(state.packed.dtype), state.chunk.shape[0]
-    wp.launch_tiled(kernel, [chunks], inputs=[state, pairs], block_dim=BLOCK_CHUNK, device=state.h.device)
+    wp.launch_tiled(kernel, dim=[chunks], inputs=[state, pairs], block_dim=BLOCK_CHUNK, device=state.h.device)
     _launch(_step_kernel, state, state, pairs)

@@ -62,8 +62,7 @@ from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel, native_
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, launch_passes, threads_for
 
-START, FIRST_SWEEP, LAST_SWEEP, MEASURE, CHOOSE, ADVANCE = range(6)
-"""Passes in order; as in ``theta_flow.h``."""
+START, FIRST_SWEEP, LAST_SWEEP, MEASURE, CHOOSE, ADVANCE = range(6)  # passes in order; as in ``theta_flow.h``
 _START_BLOCKS = 4
 """Blocks of a GPU that share a chunk of moments at the start of a solve, where a moment takes a group of threads."""
 _RESIDENT_BLOCKS = {wp.float32: (3, 5), wp.float64: (2, 3)}
@@ -97,12 +96,9 @@ def _begin_kernel(dtype, group: int, responding: bool):
     @wp.func_native("warpmag::begin_world(state, w);")
     def begin_world(state: state_struct, w: int): ...
 
-    @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        module_options=_options(dtype, group, responding),
-        launch_bounds=(256, _RESIDENT_BLOCKS[dtype][0]),
-    )
+    bounds, options = (256, _RESIDENT_BLOCKS[dtype][0]), _options(dtype, group, responding)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=options, launch_bounds=bounds)
     def begin_flow(state: state_struct):
         block, lane = wp.tid()
         chunk = state.chunk[block // wp.static(_START_BLOCKS)]

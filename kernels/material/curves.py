@@ -42,8 +42,7 @@ MIXED, TANH, LANGEVIN, CLAMPED, FROHLICH, LINEAR, FIRST_TABLE = range(-1, 6)
 CURVE_IDS = {"tanh": TANH, "langevin": LANGEVIN, "clamped": CLAMPED, "frohlich": FROHLICH}
 """Ids of the curves with a token."""
 _COLUMNS = 8
-_BEYOND = 1e30
-"""Reduced field and magnetization of the padding, which no field reaches."""
+_BEYOND = 1e30  # reduced field and magnetization of the padding, which no field reaches
 
 
 @dataclass(frozen=True)
@@ -80,10 +79,8 @@ def curve_tables(measured, dtype, device) -> wp.array:
 def _rows(measured) -> np.ndarray:
     """Return the rows of one measured curve, shape [knots, 8]."""
     k = 3.0 / (1.0 + 3.0 / measured.susceptibility)
-    y, c = (
-        k * np.asarray(measured.fields) / measured.saturation,
-        np.asarray(measured.magnetizations) / measured.saturation,
-    )
+    y, c = k * np.asarray(measured.fields), np.asarray(measured.magnetizations)
+    y, c = y / measured.saturation, c / measured.saturation
     slope = np.asarray(measured.slopes) / k
     span, rise = np.diff(y), np.diff(c)
     begin, end = span * slope[:-1], span * slope[1:]
@@ -100,22 +97,18 @@ for _dtype in (wp.float32, wp.float64):
     @wp.func_native("return warpmag::curve_ratio(s, curve, tables.data);")
     def curve_ratio(s: _dtype, curve: int, tables: wp.array2d[_dtype]) -> _dtype:
         """c(s)/s, the factor between a reduced field vector and its reduced magnetization; 1 at s = 0."""
-        ...
 
     @wp.func_native("return warpmag::curve_slope(s, curve, tables.data);")
     def curve_slope(s: _dtype, curve: int, tables: wp.array2d[_dtype]) -> _dtype:
         """Derivative c'(s) for s ≥ 0."""
-        ...
 
     @wp.func_native("return warpmag::curve_area(s, curve, tables.data);")
     def curve_area(s: _dtype, curve: int, tables: wp.array2d[_dtype]) -> wp.float64:
         """Area ∫ c ds from 0 to ``s``."""
-        ...
 
     @wp.func_native("return warpmag::inverse_curve_ratio(c, curve, tables.data);")
     def inverse_curve_ratio(c: _dtype, curve: int, tables: wp.array2d[_dtype]) -> _dtype:
         """Ratio s/c of the reduced field s to the reduced magnetization ``c``; large but finite at saturation."""
-        ...
 
 
 @wp.func

@@ -39,19 +39,13 @@ from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import CHUNK, LINE, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
-MOST_KINDS = 16
-"""Largest number of different susceptibilities; if there are more, quantiles represent all of them."""
-CANDIDATES = 64
-"""Capacity of a ball's list of candidates, which are near or may become near."""
-MARGIN = 0.05
-"""Fraction of its radius that a ball may move before candidates are searched again."""
+MOST_KINDS = 16  # largest number of different susceptibilities; if there are more, quantiles represent all of them
+CANDIDATES = 64  # capacity of a ball's list of candidates, which are near or may become near
+MARGIN = 0.05  # fraction of its radius that a ball may move before candidates are searched again
 _SEARCH_RATIO = 0.5 * contact_table.REACH + MARGIN
-NEAR_SLOTS = 32
-"""Slots for near balls; balls that do not overlap have at most about 24."""
-CONTACT_SLOTS = 16
-"""Slots for contacts: the first of the slots for near balls."""
-GROUP = 8
-"""Threads of a GPU that share a ball."""
+NEAR_SLOTS = 32  # slots for near balls; balls that do not overlap have at most about 24
+CONTACT_SLOTS = 16  # slots for contacts: the first of the slots for near balls
+GROUP = 8  # threads of a GPU that share a ball
 SWEEPS = 2
 """Sweeps before each field evaluation and before forces. With one, a cold solve of a pile takes twice as many
 evaluations."""
@@ -60,12 +54,9 @@ _LAST_SWEEP_PASS = 2 * SWEEPS
 _ROWS = dict(
     PAIR_ROWS=8, PAIR_SLOPE_ROWS=2, CONDUCTANCE_ROWS=17, CONDUCTANCE_SLOPE_ROWS=14, STATE_ROWS=16, CACHED_ROWS=24
 )  # fmt: skip
-_START_ARRAYS = ("state", "last_state", "sources")
-"""Arrays from which the sweeps of the next solve start."""
-_BALLS_PER_THREAD = 500
-"""Fewest balls per thread of a CPU."""
-_PAIRS_PER_THREAD = 20000
-"""Fewest pairs of a ball and a permanent moment per thread of a CPU: 0.1 ms."""
+_START_ARRAYS = ("state", "last_state", "sources")  # arrays from which the sweeps of the next solve start
+_BALLS_PER_THREAD = 500  # fewest balls per thread of a CPU
+_PAIRS_PER_THREAD = 20000  # fewest pairs of a ball and a permanent moment per thread of a CPU: 0.1 ms
 _EIGENVALUES = 0.4, 4.0
 """Bounds of the eigenvalues of 1 + ΔC M, scaled by s, in piles of any permeability, touching or overlapping."""
 
@@ -92,13 +83,14 @@ def _constants() -> dict[str, int | float]:
 
 @cache
 def contact_arrays(dtype) -> Any:
-    """Return the struct of the arrays of scalar type ``dtype``; ``NearArrays`` in ``state.h``."""
+    """Return the struct of the arrays of the passes, for n moments; ``NearArrays`` in ``state.h``.
+
+    Balls are moments padded to a multiple of ``CHUNK``.
+    """
     vec3 = wp.types.vector(3, dtype)
 
     @wp.struct
     class ContactArrays:
-        """Arrays of the passes, for n moments; balls are moments padded to a multiple of ``CHUNK``."""
-
         balls: int
         moment_stride: int  # numbers in a row of ``packed``
         kinds: int  # number of kinds of material
@@ -193,11 +185,10 @@ def allocate(
         susceptibility: Susceptibility of each moment, which may be infinite, shape [n].
         material: Curves of the moments (``curves.CurveParameters``).
         ranges: First moment, first permanent moment and end of each world.
-        magnets: True for moments of permanent magnets, shape [n].
+        magnets: True for moments of permanent magnets, fixed or with a recoil permeability, shape [n].
         single: True for moments that are their body's only one, shape [n].
         field: Evaluation of the field at the moments (``evaluate.PairEvaluation``), whose last partial sum is written.
-        movable: True for moments whose force is evaluated, shape [n].
-        rotatable: True for moments whose torque is evaluated, shape [n].
+        movable, rotatable: True for moments whose force and torque are evaluated, shape [n].
         forces, torques: In and out [N, N·m], Warp arrays, shape [n].
         expansion: Expansions of the sources' fields about the moments (``applied/balls.h``), or None.
     """
@@ -226,17 +217,11 @@ def allocate(
     pairs, a.magnets = nonuniform.allocate(
         balls, ranges, eligible, magnets, single, movable, dtype=dtype, device=device, expansion=expansion
     )
-    return NearContactBuffers(
-        dtype=dtype,
-        lists=lists,
-        arrays=a,
-        reach=reach,
-        nonuniform_threads=threads_for(pairs, _PAIRS_PER_THREAD) if pairs or expansion is not None else 0,
-        threads=threads_for(n, _BALLS_PER_THREAD),
-        stream=wp.Stream(device, priority=-1) if device.is_cuda else None,
-        events=tuple(wp.Event(device) for _ in range(3)) if device.is_cuda else (),
-        commands={},
-    )
+    threads = threads_for(n, _BALLS_PER_THREAD)
+    nonuniform_threads = threads_for(pairs, _PAIRS_PER_THREAD) if pairs or expansion is not None else 0
+    stream = wp.Stream(device, priority=-1) if device.is_cuda else None
+    events = tuple(wp.Event(device) for _ in range(3)) if device.is_cuda else ()
+    return NearContactBuffers(dtype, lists, a, reach, threads, nonuniform_threads, stream, events, commands={})
 
 
 def _field_rows(field, n: int) -> np.ndarray:
@@ -288,15 +273,7 @@ def _set_pairs(a, balls: int, dtype, device) -> None:
     a.state, a.last_state, a.cached = zeros(*states), zeros(*states), zeros(*cached)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Launches
-# ---------------------------------------------------------------------------------------------------------------------
-
-
-_HEADERS = {
-    **{"Positions": "select", "Pairs": "tabulate", "Sweeps": "sweeps"},
-    **{"Forces": "forces", "NonuniformField": "nonuniform"},
-}
+_HEADERS = dict(Positions="select", Pairs="tabulate", Sweeps="sweeps", Forces="forces", NonuniformField="nonuniform")
 
 
 @cache
@@ -348,7 +325,7 @@ def launch_find_pairs(buffers: NearContactBuffers):
 def launch_sweeps(buffers: NearContactBuffers):
     """Move the contact sources towards equilibrium with the packed moments, and write 4π H_near to the field sums.
 
-    On a GPU this runs in parallel with the following launches, until :func:`wait_for_field` and :func:`wait`.
+    On a GPU this runs in parallel with the following launches, until :func:`wait`.
     """
     if buffers.reach == 0.0:
         return
@@ -359,12 +336,6 @@ def launch_sweeps(buffers: NearContactBuffers):
         _launch(buffers, "Sweeps", 1, _LAST_SWEEP_PASS)
         buffers.stream.record_event(buffers.events[1])
         _launch(buffers, "Sweeps", _LAST_SWEEP_PASS, _LAST_SWEEP_PASS + 1)
-
-
-def wait_for_field(buffers: NearContactBuffers):
-    """Make the following launches wait for the field of :func:`launch_sweeps`."""
-    if buffers.reach > 0.0 and buffers.stream is not None:
-        wp.get_stream(buffers.stream.device).wait_event(buffers.events[1])
 
 
 def launch_begin_forces(buffers: NearContactBuffers):
@@ -384,7 +355,7 @@ def launch_add_forces(buffers: NearContactBuffers):
         _launch(buffers, "NonuniformField", 0, 4)
 
 
-def wait(buffers: NearContactBuffers):
-    """Make the following launches wait for the parallel stream."""
+def wait(buffers: NearContactBuffers, *, for_field: bool = False):
+    """Make the following launches wait for the parallel stream, or only for the field of :func:`launch_sweeps`."""
     if buffers.reach > 0.0 and buffers.stream is not None:
-        wp.get_stream(buffers.stream.device).wait_event(buffers.events[2])
+        wp.get_stream(buffers.stream.device).wait_event(buffers.events[1 if for_field else 2])

@@ -41,20 +41,16 @@ from warpmag.kernels.applied.expansion import EXPANSION_ROWS, TENSOR_ROWS
 from warpmag.kernels.near_contact import contact_table
 from warpmag.kernels.shared.native import CHUNK
 
-RESPONSE_ROWS = 24
-"""Rows of a ball's response, 22 of them in use."""
-BOUND_ROWS = 8
-"""Numbers of a chunk's bounds, 5 of them in use."""
+RESPONSE_ROWS = 24  # rows of a ball's response, 22 of them in use
+BOUND_ROWS = 8  # numbers of a chunk's bounds, 5 of them in use
 
 
 @cache
 def magnet_arrays(dtype) -> Any:
-    """Return the struct of the arrays for permanent moments, of scalar type ``dtype``."""
+    """Return the struct of the arrays for permanent moments that act on balls."""
 
     @wp.struct
     class MagnetArrays:
-        """Arrays for permanent moments that act on balls."""
-
         partner_begin: wp.array[wp.int32]  # first partner: a magnet for a ball, a ball for a movable magnet
         partner_end: wp.array[wp.int32]  # index after the last partner [balls]
         movable: wp.array[wp.int32]  # 1 for permanent moments whose force is evaluated [balls]
@@ -85,14 +81,7 @@ def allocate(
 ) -> tuple[int, Any]:
     """Return the number of pairs of a ball and a permanent moment, and the arrays.
 
-    Args:
-        balls: Moments, padded to ``CHUNK``.
-        ranges: First moment, first permanent moment and end of each world.
-        eligible: True for inducible balls that take part, shape [n].
-        magnets: True for moments of permanent magnets, fixed or with a recoil permeability, shape [n].
-        single: True for moments that are their body's only one, shape [n].
-        movable: True for moments whose force is evaluated, shape [n].
-        expansion: Derivatives of the fields of sources, or None.
+    ``balls`` is the number of moments, padded to ``CHUNK``; the other arguments are those of ``near_pairs.allocate``.
     """
     n = len(eligible)
     begin, end, magnet_movable = (np.zeros(balls, np.int32) for _ in range(3))

@@ -21,22 +21,10 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.pairs import fused_cuda, mirror_cuda, sums_cuda
+from warpmag.kernels.pairs import fused_cuda, mirror_cuda, sums_cuda, work_list
 from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI, WIDTHS, Quantity
 from warpmag.kernels.pairs.reference import launch_reference_sums
-from warpmag.kernels.pairs.work_list import (
-    PAIRS_PER_THREAD,
-    TILE_COLUMNS,
-    arrays_type,
-    block_tiles,
-    cpu_tiles,
-    loop_tiles,
-    pair_count,
-    target_rows,
-    tile_size,
-    tiles_of_rank,
-)
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
@@ -48,8 +36,7 @@ LOOP, FUSED, MIRRORED, REFERENCE, GIVEN = "loop", "fused", "mirrored", "referenc
 # fastest.
 _MOST_FUSED = {Quantity.FIELD: 7000, Quantity.FORCE: 2640, Quantity.MUTUAL_FORCE: 2640, Quantity.WRENCH: 2640}
 _LEAST_MIRRORED = {Quantity.FIELD: 5281, Quantity.MUTUAL_FORCE: 2641}
-_LEAST_MUTUAL = 0.75
-"""Least fraction of the sources that are targets, for which the mirrored form is faster."""
+_LEAST_MUTUAL = 0.75  # least fraction of the sources that are targets, for which the mirrored form is faster
 _LEAST_SHARED = {"cpu": 800_000, "cuda": 1_000_000_000}
 """Fewest pairs for which several processes share the sums, by kind of device."""
 _CONSTANTS = {"CAPACITY": CAPACITY, "MU0": MU0, "INVERSE_4PI": INVERSE_4PI}
@@ -97,9 +84,9 @@ class PairEvaluation:
         self.form = GIVEN if sums else form or _choose_form(quantity, segments, device, targets is sources, extra_parts)
         if self.form == MIRRORED:
             segments = segments[:1, [2, 3, 2, 3]]
-        self._arrays = a = arrays_type(dtype)()
-        a.target, a.begin, a.end = target_rows(segments, device)
-        self.target, self.count, self.pair_count = a.target, a.target.shape[0], pair_count(segments)
+        self._arrays = a = work_list.arrays_type(dtype)()
+        a.target, a.begin, a.end = work_list.target_rows(segments, device)
+        self.target, self.count, self.pair_count = a.target, a.target.shape[0], work_list.pair_count(segments)
         shared = self.form in (LOOP, MIRRORED) and self.pair_count >= _LEAST_SHARED["cuda" if device.is_cuda else "cpu"]
         self._ranks = ranks if shared else None
         self._finished = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity
@@ -107,7 +94,7 @@ class PairEvaluation:
         shape = parts + extra_parts, max(self.count, 1), WIDTHS[quantity]
         self.partial = a.partial = (wp.zeros if extra_parts else wp.empty)(shape, dtype=dtype, device=device)
         self._summed = self.partial[:parts] if self._ranks is not None else None
-        a.tiles = wp.array(np.reshape(tiles, (-1, TILE_COLUMNS)), dtype=wp.int32, device=device)
+        a.tiles = wp.array(np.reshape(tiles, (-1, work_list.TILE_COLUMNS)), dtype=wp.int32, device=device)
         a.targets, a.sources, a.same_set = targets.packed, sources.packed, int(targets is sources)
         a.overlap, a.overlap_count = targets.overlaps, targets.overlap_counts
         a.effective = targets.moments if effective is None else effective
@@ -133,10 +120,10 @@ class PairEvaluation:
         if self.form == FUSED:
             shape = fused_cuda.choose_fused_shape(finished, count)
             self._launch_sums = lambda a: _launch_fused(finished, shape, a)
-            return 0, block_tiles(segments, shape.targets)
+            return 0, work_list.block_tiles(segments, shape.targets)
         if device.is_cuda:
             shape = sums_cuda.choose_loop_shape(finished, count)
-            tiles, parts = loop_tiles(segments, shape, device.sm_count)
+            tiles, parts = work_list.loop_tiles(segments, shape, device.sm_count)
             if self._ranks is not None:
                 tiles = tiles[slice(*self._ranks.share(len(tiles)))]
             self._launch_sums = lambda a: sums_cuda.launch_pair_loop_cuda(
@@ -144,9 +131,9 @@ class PairEvaluation:
             )
             return parts, tiles
         mutual = same_set and quantity in (Quantity.FIELD, Quantity.MUTUAL_FORCE)
-        tiles, shares, parts, threads = cpu_tiles(segments, mutual, targets.dtype)
+        tiles, shares, parts, threads = work_list.cpu_tiles(segments, mutual, targets.dtype)
         if self._ranks is not None:
-            tiles, shares = tiles_of_rank(tiles, shares, self._ranks)
+            tiles, shares = work_list.tiles_of_rank(tiles, shares, self._ranks)
         self._arrays.shares = wp.array(shares, dtype=wp.int32, device=device)
         pair_loop = _cpu_loop_kernel(targets.dtype, quantity)
         self._launch_sums = lambda _: self._launch_pass(pair_loop, threads)
@@ -166,7 +153,7 @@ class PairEvaluation:
         if self.form != FUSED:
             finish = _finish_kernel(self.partial.dtype, self._finished, group_threads(self.partial.device))
             # the threads that summed are awake, and a row whose overlap list is full visits all its sources
-            self._launch_pass(finish, threads_for(self.pair_count, PAIRS_PER_THREAD))
+            self._launch_pass(finish, threads_for(self.pair_count, work_list.PAIRS_PER_THREAD))
 
     def _launch_pass(self, kernel, threads):
         """Launch a pass over the target rows. The launch is recorded, so that the struct is packed only once."""
@@ -199,15 +186,15 @@ def _are_mutual(segments, count: int) -> bool:
 @cache
 def _finish_kernel(dtype, quantity: Quantity, group: int):
     call = f"finish<warpmag::Quantity({quantity:d})>(thread, threads, team.data, arrays)"
-    arguments = {**PASS_ARGUMENTS, "arrays": arrays_type(dtype)}
+    arguments = {**PASS_ARGUMENTS, "arrays": work_list.arrays_type(dtype)}
     return native_kernel(call, "pairs/finish.h", arguments, dtype=dtype, GROUP=group, **_CONSTANTS)
 
 
 @cache
 def _cpu_loop_kernel(dtype, quantity: Quantity):
     call = f"cpu::sum_tiles<warpmag::Quantity({quantity:d})>(arrays, threads, team.data)"
-    arguments = {**PASS_ARGUMENTS, "arrays": arrays_type(dtype)}
-    return native_kernel(call, "pairs/sums_cpu.h", arguments, dtype=dtype, TILE_SIZE=tile_size(dtype))
+    arguments = {**PASS_ARGUMENTS, "arrays": work_list.arrays_type(dtype)}
+    return native_kernel(call, "pairs/sums_cpu.h", arguments, dtype=dtype, TILE_SIZE=work_list.tile_size(dtype))
 
 
 @cache
@@ -216,7 +203,7 @@ def _fused_kernel(dtype, quantity: Quantity, shape):
     return native_kernel(
         f"sum_and_finish<warpmag::Quantity({quantity:d}), {numbers}>(arrays)",
         "pairs/fused_finish_cuda.h",
-        {"arrays": arrays_type(dtype)},
+        {"arrays": work_list.arrays_type(dtype)},
         dtype=dtype,
         launch={"grid_stride": False, "launch_bounds": (shape.threads, 1)},
         GROUP=shape.shares,

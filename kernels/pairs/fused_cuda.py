@@ -21,19 +21,14 @@ class FusedShape:
         return self.targets_per_lane * self.lanes
 
     @property
-    def summing(self) -> int:
-        """Threads of a block that sum pairs."""
-        return 32 * self.warps
-
-    @property
     def correcting(self) -> int:
-        """Threads of a block that correct overlapping pairs, after those that sum."""
+        """Threads of a block that correct overlapping pairs."""
         return 32 * max(min(4, math.ceil(self.targets / 8)), math.ceil(self.targets / 32))
 
     @property
     def threads(self) -> int:
-        """Threads per block."""
-        return self.summing + self.correcting
+        """Threads per block: those that sum pairs, then those that correct."""
+        return 32 * self.warps + self.correcting
 
     @property
     def shares(self) -> int:

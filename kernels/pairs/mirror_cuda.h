@@ -17,18 +17,18 @@ namespace warpmag {
 
 // Moments of a home tile that a lane holds, and their sums.
 template <Quantity Q, int MOMENTS> struct HomeMoments {
-    Moment own[MOMENTS];
+    Moment moments[MOMENTS];
     Vec3<Real> scaled[MOMENTS], sums[MOMENTS];
     static constexpr Real SCALE = scaled_moment(Quantity::FIELD);
 
-    // Adds a moment of another tile to the sums h of the own moments, and the own moments to its sums g. inverse(k,
-    // d2) is the inverse distance to the k-th.
+    // Adds a moment of another tile to the sums h of the home moments, and these to its sums g. inverse(k, d2) is the
+    // inverse distance to the k-th.
     template <class Inverse>
     CUDA_CALLABLE void add(Vec3<Real> (&h)[MOMENTS], Vec3<Real>& g, const Source<Real>& source, Inverse inverse) {
 #pragma unroll
         for (int k = 0; k < MOMENTS; ++k) {
-            const Vec3<Real> r = own[k].x - source.x;
-            add_mirrored_pair<Q>(h[k], g, r, inverse(k, dot(r, r)), source, own[k].m, scaled[k]);
+            const Vec3<Real> r = moments[k].x - source.x;
+            add_mirrored_pair<Q>(h[k], g, r, inverse(k, dot(r, r)), source, moments[k].m, scaled[k]);
         }
     }
 };
@@ -54,7 +54,8 @@ CUDA_CALLABLE inline Vec3<Real> add_mirrored_stage(HomeMoments<Q, MOMENTS>& home
         const Real radius = staged[128].x;
         Real clamp[MOMENTS];
 #pragma unroll
-        for (int k = 0; k < MOMENTS; ++k) clamp[k] = (home.own[k].radius + radius) * (home.own[k].radius + radius);
+        for (int k = 0; k < MOMENTS; ++k)
+            clamp[k] = (home.moments[k].radius + radius) * (home.moments[k].radius + radius);
 #pragma unroll UNROLLED
         for (int step = 0; step < 32; ++step)
             add_step(lane + step, [&](int k, Real d2) { return inverse_root(max(d2, clamp[k])); });
@@ -64,8 +65,8 @@ CUDA_CALLABLE inline Vec3<Real> add_mirrored_stage(HomeMoments<Q, MOMENTS>& home
             const Quad c = staged[lane + step + 128];
             const int offset = (lane + step) % 32 - own;
             add_step(lane + step, [&](int k, Real d2) {
-                const bool masked = offset == 32 * k || (!FIELD && c.y == home.own[k].label);
-                return masked_inverse(d2, home.own[k].radius + c.x, masked);
+                const bool masked = offset == 32 * k || (!FIELD && c.y == home.moments[k].label);
+                return masked_inverse(d2, home.moments[k].radius + c.x, masked);
             });
         }
     }
@@ -103,12 +104,12 @@ CUDA_CALLABLE inline void sum_mirrored(int block, int thread, const wp::array_t<
     for (int k = 0; k < MOMENTS; ++k) {
         // lanes beyond the last moment repeat it with a zero moment, and are not written
         const int row = row_begin + lane + 32 * k;
-        home.own[k] = table.moment(tiles.origin + min(row, row_end - 1), row < row_end);
-        home.scaled[k] = home.SCALE * home.own[k].m;
+        home.moments[k] = table.moment(tiles.origin + min(row, row_end - 1), row < row_end);
+        home.scaled[k] = home.SCALE * home.moments[k].m;
         home.sums[k] = {};
     }
     LabelRange labels;
-    if constexpr (!FIELD) labels = LabelRange::of<32>(home.own);
+    if constexpr (!FIELD) labels = LabelRange::of<32>(home.moments);
 
     Quad* staged = staging[warp];
 #pragma unroll 1

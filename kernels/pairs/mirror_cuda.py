@@ -35,16 +35,13 @@ _SHAPES = {
     ),
     Quantity.MUTUAL_FORCE: ((7000, MirrorShape(2, 4, 6, 2)), (None, MirrorShape(4, 4, 4, 1))),
 }
-_MOST_DOUBLE_WARPS = 4
-"""Most warps per block in float64, limited by shared memory."""
-_SLAB_BYTES = 2**28
-"""Most memory of slabs. A slab holds the partial sums of one distance between tiles."""
+_MOST_DOUBLE_WARPS = 4  # most warps per block in float64, limited by shared memory
+_SLAB_BYTES = 2**28  # most memory of slabs. A slab holds the partial sums of one distance between tiles
 _MOST_SPLITS, _MOST_STAGES = 32, 32
 """Most blocks that share the walk of a tile, and most stages in a warp's sum: longer sums would lose digits."""
 _SPLITS_TOGETHER = 4
 """With several passes the number of splits is a multiple of this, so that this many processes can share them."""
-_FIXED_COST = 0.1
-"""Cost of starting and ending a block, and of adding up a split, in units of a warp's stage."""
+_FIXED_COST = 0.1  # cost of starting and ending a block, and of adding up a split, in units of a warp's stage
 
 
 @wp.struct

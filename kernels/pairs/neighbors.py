@@ -21,16 +21,14 @@ from warpmag.kernels.shared.native import native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
 
-CAPACITY = 64
-"""Length of a list."""
+CAPACITY = 64  # length of a list
 SKIN = 0.6
 """Fraction of its radius that a moment may move before the lists are rebuilt. A larger skin makes lists longer and
 rebuilds rarer. Longer lists also save field evaluations of the induction, which predicts the moments of neighbors
 (``theta_flow``)."""
 _BUCKETS_PER_MOMENT = 4
 _BLOCK = 128
-_PADDING = 16
-"""Entries beyond the last that vectors may read."""
+_PADDING = 16  # entries beyond the last that vectors may read
 
 
 @cache
@@ -41,7 +39,7 @@ def lists_type(dtype):
     @wp.struct
     class NeighborLists:
         # Model:
-        group: wp.array[int]  # only moments of one group are neighbors; none if negative
+        group: wp.array[int]  # only moments of one group are neighbors; none if negative, shape [n] or longer
         ratio: wp.float64  # distance of neighbors over their contact distance, at most
         reach: wp.array[wp.float64]  # largest contact distance [m], shape [1]
         # Data in:
@@ -68,13 +66,9 @@ def lists_type(dtype):
 
 
 def allocate(count: int, packed, group, *, reach: float, ratio=1.0 + SKIN, capacity=CAPACITY):
-    """Allocate empty lists; return the struct :func:`lists_type`.
+    """Allocate empty lists of ``count`` moments; return the struct :func:`lists_type`, which describes the arguments.
 
-    Args:
-        group: Group of each moment, shape [n] or longer: only moments of one group are neighbors, none if negative.
-        reach: Largest contact distance [m].
-        ratio: Largest distance of neighbors over their contact distance; 1 lists overlapping pairs only.
-        capacity: Length of a list.
+    A ``ratio`` of 1 lists overlapping pairs only.
     """
     device, dtype = packed.device, packed.dtype
     linked, padded = (0, count + _PADDING) if device.is_cpu else (count, 0)
@@ -125,9 +119,8 @@ def _launch(call: str, targets, sources, dim: int = 1):
 def launch_find_neighbors(targets, sources):
     """List the sources near each target, if a target has moved too far since the last search.
 
-    Args:
-        targets: Lists of the targets, with the reach of targets and sources.
-        sources: Lists of the sources, with the hash table. If they are ``targets``, a moment is not its own neighbor.
+    The lists of the targets have the reach of both, those of the sources the hash table. If both are the same, a moment
+    is not its own neighbor.
     """
     if targets.packed.device.is_cpu:
         _launch("search_neighbors(targets, sources, threads, team.data)", targets, sources)

@@ -73,11 +73,8 @@ class PackedMoments:
         count: Number of moments n.
         packed: Packed moments, shape [8, n].
         moments: Rows of the moments, a view of ``packed``, shape [3, n].
-        neighbors: Neighbors of each moment, shape [n, capacity], valid after :meth:`find_overlaps`.
-        neighbor_counts: Number of neighbors, shape [n]; zero before the first search.
-        searching: Nonzero if the last :meth:`find_overlaps` rebuilt the lists, shape [1].
-        overlaps: Neighbors that overlap each moment, shape [n, capacity].
-        overlap_counts: Number of overlapping neighbors, shape [n].
+        neighbors, neighbor_counts, overlaps, overlap_counts, searching: Lists of ``neighbors.lists_type``, valid after
+            :meth:`find_overlaps`; without neighbors before.
     """
 
     def __init__(self, radii, *, largest_radius: float, labels=None, groups=None, moving=True):

@@ -29,8 +29,7 @@ _SHAPES = {
     Quantity.WRENCH: ((None, LoopShape(3, 4, 3)),),
 }
 _MOST_SPLITS = 32
-_FIXED_COST = 16
-"""Cost of starting and ending a block, in units of one source."""
+_FIXED_COST = 16  # cost of starting and ending a block, in units of one source
 
 
 def choose_loop_shape(quantity: Quantity, count: int) -> LoopShape:

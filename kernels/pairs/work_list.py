@@ -1,7 +1,8 @@
 """Work lists of the sums over pairs: target rows, and tiles of target rows and sources.
 
-A segment is a range of packed targets with a range of packed sources. The targets of all segments, one after the other,
-are the target rows. A tile is a range of target rows with a range of sources.
+A segment is a range of packed targets with a range of packed sources: begin and end of both, as packed columns. The
+targets of all segments, one after the other, are the target rows. A tile is a range of target rows with a range of
+sources.
 """
 
 import math
@@ -20,14 +21,10 @@ target, sources begin and end, partial sums of the targets, 1 for a mirrored til
 mirrored tile also stands for the tile with targets and sources exchanged. A GPU reads a row as two vectors."""
 PAIRS_PER_THREAD = 400_000
 """Pairs per thread, at least. Waking a thread takes 50 to 100 µs, the time of half as many pairs."""
-_LEAST_SHARE = 50_000
-"""Pairs per share, at least; small blocks are joined into one share."""
-_TILE_BYTES = 2560
-"""Bytes per component of a tile's sources that a CPU keeps in its first-level cache."""
-_LEAST_TARGETS = 32
-"""Targets per tile, at least, so that loading its sources is worthwhile."""
-_LANES = 16
-"""Lanes of the widest vectors; stripes are a multiple of it, so that no lane is idle."""
+_LEAST_SHARE = 50_000  # pairs per share, at least; small blocks are joined into one share
+_TILE_BYTES = 2560  # bytes per component of a tile's sources that a CPU keeps in its first-level cache
+_LEAST_TARGETS = 32  # targets per tile, at least, so that loading its sources is worthwhile
+_LANES = 16  # lanes of the widest vectors; stripes are a multiple of it, so that no lane is idle
 
 
 def target_rows(segments, device):
@@ -80,11 +77,8 @@ def cpu_tiles(segments, mutual: bool, dtype):
     write separate partial sums. The cuts depend on the arguments alone, and so does the order of each sum, whatever the
     number of threads. Threads take shares, which are runs of whole blocks, the largest first.
 
-    Args:
-        segments: Integers [k, 4]: targets begin and end, sources begin and end, as packed columns.
-        mutual: True if a pair may be summed for both its moments. Targets among their own sources then need only the
-            blocks on and above the diagonal, as mirrored tiles.
-        dtype: Warp scalar type of the sums.
+    If ``mutual``, a pair may be summed for both its moments. Targets among their own sources then need only the blocks
+    on and above the diagonal, as mirrored tiles.
     """
     tiles, begin, parts = _cut(tuple(map(tuple, segments.tolist())), mutual, tile_size(dtype))
     threads = min(threads_for(pair_count(segments), PAIRS_PER_THREAD), max(len(begin) - 1, 1))

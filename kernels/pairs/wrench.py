@@ -22,8 +22,7 @@ from warpmag.kernels.material.curves import LINEAR, CurveParameters, curve_deriv
 from warpmag.kernels.pairs.packing import ball_volume
 from warpmag.kernels.shared.native import native_options
 
-MU0 = 1.2566370614359173e-06
-"""Vacuum permeability [T·m/A], the conventional 4π·10⁻⁷."""
+MU0 = 1.2566370614359173e-06  # vacuum permeability [T·m/A], the conventional 4π·10⁻⁷
 
 
 @cache

@@ -16,8 +16,7 @@ from warpmag.kernels.shared.reductions import group_sum
 
 wp.set_module_options({"enable_backward": False})
 
-_THREADS = 32
-"""Threads of a GPU that sum the moments of a body, a warp."""
+_THREADS = 32  # threads of a GPU that sum the moments of a body, a warp
 _sum_group = group_sum(wp.spatial_vectord)
 
 
@@ -99,11 +98,9 @@ def gather_moments(
 
     If the present attributes of a shape differ from the initial ones, its index plus 1 is written to ``changed`` [1].
     """
-    outputs = [positions, moments, changed]
+    inputs, outputs = [body_q, magnets, present, initial], [positions, moments, changed]
     dim = max(len(positions), len(present.kind))
-    wp.launch(
-        _gather_moments, dim, inputs=[body_q, magnets, present, initial], outputs=outputs, device=positions.device
-    )
+    wp.launch(_gather_moments, dim, inputs=inputs, outputs=outputs, device=positions.device)
 
 
 @wp.kernel

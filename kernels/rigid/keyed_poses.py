@@ -7,20 +7,12 @@ q₁ over Δt. A solver that moves bodies by their velocities moves the body to 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.rigid.keys import (
-    KeyedValues,
-    fraction_after,
-    interpolate_number,
-    interpolate_quaternion,
-    key_before,
-    keyed_values,
-)
+from warpmag.kernels.rigid import keys
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,7 +28,8 @@ _RADIANS = wp.constant(wp.float64(np.pi / 180.0))
 class KeyedPoses:
     """Bodies that follow keys, for b bodies with o transforms."""
 
-    keyed: KeyedValues  # the keys, a curve for each transform
+    time: wp.array[wp.float64]  # time on the device [s], shape [1]
+    keyed: keys.KeyedValues  # the keys, a curve for each transform
     kind: wp.array[wp.int32]  # index of each transform's type in ``TRANSFORMS``, shape [o]
     inverse: wp.array[wp.int32]  # 1 for inverted transforms, shape [o]
     first: wp.array[wp.int32]  # first (outermost) transform of each body, and the one after the last, shape [b + 1]
@@ -76,40 +69,30 @@ def _euler_rotation(order: int, angles: wp.vec3d) -> wp.quatd:
 
 
 @wp.func
-def _matrix_of(position: wp.vec3d, rotation: wp.mat33d) -> wp.mat44d:
-    """Return the matrix of a rotation, or any linear map, followed by a translation."""
-    zero = wp.float64(0.0)
-    return wp.mat44d(
-        rotation[0, 0], rotation[0, 1], rotation[0, 2], position[0],
-        rotation[1, 0], rotation[1, 1], rotation[1, 2], position[1],
-        rotation[2, 0], rotation[2, 1], rotation[2, 2], position[2],
-        zero, zero, zero, wp.float64(1.0),
-    )  # fmt: skip
-
-
-@wp.func
 def _transform_at(poses: KeyedPoses, o: int, time: wp.float64) -> wp.mat44d:
     """Return the matrix of a transform at a time; it multiplies column vectors."""
-    key = key_before(poses.keyed, o, time)
-    fraction = fraction_after(poses.keyed, o, key, time)
+    key = keys.key_before(poses.keyed, o, time)
+    fraction = keys.fraction_after(poses.keyed, o, key, time)
     kind = poses.kind[o]
     matrix = wp.identity(n=4, dtype=wp.float64)
     if kind == _MATRIX:
         for i in range(4):
             for j in range(4):
-                matrix[i, j] = interpolate_number(poses.keyed, o, key, fraction, 4 * j + i)
+                matrix[i, j] = keys.interpolate_number(poses.keyed, o, key, fraction, 4 * j + i)
         return matrix
-    zero = wp.vec3d()
+    zero, one = wp.vec3d(), wp.vec3d(wp.float64(1.0))
     if kind == _ORIENT:
-        return _matrix_of(zero, wp.quat_to_matrix(interpolate_quaternion(poses.keyed, o, key, fraction)))
+        return wp.transform_compose(zero, keys.interpolate_quaternion(poses.keyed, o, key, fraction), one)
     values = wp.vec3d()
     for i in range(3):
-        values[i] = interpolate_number(poses.keyed, o, key, fraction, i)
+        values[i] = keys.interpolate_number(poses.keyed, o, key, fraction, i)
     if kind == _TRANSLATE:
-        return _matrix_of(values, wp.identity(n=3, dtype=wp.float64))
+        return wp.transform_compose(values, wp.quat_identity(dtype=wp.float64), one)
     if kind == _SCALE:
-        return _matrix_of(zero, wp.diag(values))
-    return _matrix_of(zero, wp.quat_to_matrix(_euler_rotation(kind - _ROTATE, values)))
+        for i in range(3):
+            matrix[i, i] = values[i]
+        return matrix
+    return wp.transform_compose(zero, _euler_rotation(kind - _ROTATE, values), one)
 
 
 @wp.func
@@ -150,7 +133,6 @@ def _write_joint(
 @wp.kernel
 def _write_poses(
     poses: KeyedPoses,
-    time_in: wp.array[wp.float64],
     begin: wp.float64,
     duration: wp.float64,
     at_end: int,
@@ -161,7 +143,7 @@ def _write_poses(
 ):
     k = wp.tid()
     body = poses.body[k]
-    pose0, pose1 = _pose(poses, k, time_in[0] + begin), _pose(poses, k, time_in[0] + begin + duration)
+    pose0, pose1 = _pose(poses, k, poses.time[0] + begin), _pose(poses, k, poses.time[0] + begin + duration)
     com = wp.vec3d(poses.com[body])
     moved = wp.transform_point(pose1, com) - wp.transform_point(pose0, com)
     turn = wp.transform_get_rotation(pose1) * wp.quat_inverse(wp.transform_get_rotation(pose0))
@@ -182,16 +164,8 @@ def _write_poses(
         _write_joint(poses, poses.joint[k], pose, qd, joint_q_out, joint_qd_out)
 
 
-@dataclass(frozen=True)
-class PosedBodies:
-    """Bodies of a model that follow keys by a clock."""
-
-    arrays: Any  # arrays of the kernels, :class:`KeyedPoses`
-    time: wp.array  # time on the device [s], shape [1]
-
-
-def pose_bodies(bodies: dict[int, Sequence], joints: Sequence[int], model, time: wp.array) -> PosedBodies:
-    """Return bodies that follow keys, with the time on the device [s], float64, shape [1].
+def keyed_poses(bodies: dict[int, Sequence], joints: Sequence[int], model, time: wp.array) -> Any:
+    """Return the :class:`KeyedPoses` of bodies that follow keys by the time on the device [s], float64, shape [1].
 
     Each body has transforms, the outermost first, with ``kind``, ``keys`` and ``inverse``. ``joints`` are the bodies'
     free joints, -1 for bodies without one.
@@ -202,7 +176,7 @@ def pose_bodies(bodies: dict[int, Sequence], joints: Sequence[int], model, time:
         return wp.array(np.array(values, np.int32), dtype=wp.int32, device=time.device)
 
     a = KeyedPoses()
-    a.keyed = keyed_values([transform.keys for transform in transforms], time.device)
+    a.time, a.keyed = time, keys.keyed_values([transform.keys for transform in transforms], time.device)
     a.kind = put([TRANSFORMS.index(transform.kind) for transform in transforms])
     a.inverse = put([transform.inverse for transform in transforms])
     a.first, a.body, a.joint = put(np.cumsum([0, *map(len, bodies.values())])), put(list(bodies)), put(joints)
@@ -210,15 +184,15 @@ def pose_bodies(bodies: dict[int, Sequence], joints: Sequence[int], model, time:
     if model.joint_count:
         a.joint_q_start, a.joint_qd_start = model.joint_q_start, model.joint_qd_start
         a.parent_frame, a.child_frame = model.joint_X_p, model.joint_X_c
-    return PosedBodies(a, time)
+    return a
 
 
-def write_keyed_poses(bodies: PosedBodies, state, begin: float, duration: float, *, at_end: bool):
+def write_keyed_poses(poses, state, begin: float, duration: float, *, at_end: bool):
     """Write poses, and the mean velocities over an interval, of bodies to a state; capturable in a graph.
 
     The interval of length ``duration`` [s] starts at ``begin`` [s], relative to the clock. Poses are those at its end
     or at its start. Coordinates of free joints are written, too.
     """
-    inputs = [bodies.arrays, bodies.time, wp.float64(begin), wp.float64(duration), int(at_end)]
+    inputs = [poses, wp.float64(begin), wp.float64(duration), int(at_end)]
     outputs = [state.body_q, state.body_qd, state.joint_q, state.joint_qd]
-    wp.launch(_write_poses, dim=len(bodies.arrays.body), inputs=inputs, outputs=outputs, device=bodies.time.device)
+    wp.launch(_write_poses, dim=len(poses.body), inputs=inputs, outputs=outputs, device=poses.time.device)

@@ -13,8 +13,7 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-INTERPOLATIONS = ("linear", "held", "slerp")
-"""Interpolations between two keys; ``slerp`` is for quaternions."""
+INTERPOLATIONS = ("linear", "held", "slerp")  # interpolations between two keys; ``slerp`` is for quaternions
 _HELD, _SLERP = wp.constant(1), wp.constant(2)
 _LINEAR_LIMIT = wp.constant(wp.float64(1e-5))
 """Quaternions whose dot product differs from 1 by less are interpolated linearly, as in USD."""
@@ -118,20 +117,17 @@ def interpolate_quaternion(keyed: KeyedValues, curve: int, key: int, fraction: w
     return wp.normalize(a)
 
 
-@wp.struct
-class Clock:
-    """Time on the device, and the number of substeps that share values."""
-
-    time: wp.array[wp.float64]  # time [s], shape [1]
-    shared: wp.array[wp.int32]  # number of substeps that share values, shape [1]
-
-
 @wp.kernel
 def _write_values(
-    keyed: KeyedValues, clock: Clock, offset: wp.float64, substep: wp.float64, targets_out: wp.array[wp.uint64]
+    keyed: KeyedValues,
+    time_in: wp.array[wp.float64],
+    sharing_in: wp.array[wp.int32],
+    offset: wp.float64,
+    substep: wp.float64,
+    targets_out: wp.array[wp.uint64],
 ):
     curve = wp.tid()
-    time = clock.time[0] + offset + wp.float64(0.5) * wp.float64(clock.shared[0] - 1) * substep
+    time = time_in[0] + offset + wp.float64(0.5) * wp.float64(sharing_in[0] - 1) * substep
     key = key_before(keyed, curve, time)
     fraction = fraction_after(keyed, curve, key, time)
     width = keyed.width[curve]
@@ -152,12 +148,9 @@ class KeyedArrays:
 
 
 def keyed_arrays(curves: Sequence, targets: Sequence[wp.array], time: wp.array) -> KeyedArrays:
-    """Return arrays that follow keys.
+    """Return arrays that follow keys, linear or held, by the time on the device [s], float64, shape [1].
 
-    Args:
-        curves: Curves of :func:`keyed_values`, linear or held.
-        targets: For each curve a contiguous array of float32, or of vectors of them, that receives its numbers.
-        time: Time on the device [s], float64, shape [1].
+    Each target is a contiguous array of float32, or of vectors of them, that receives the numbers of a curve.
     """
     for curve, target in zip(curves, targets, strict=True):
         size = target.size * wp.types.type_size_in_bytes(target.dtype)
@@ -179,8 +172,7 @@ def write_keyed_values(
             the first and the last of these substeps. None means one.
         substep: Length of a substep [s].
     """
-    clock = Clock()
-    clock.time, clock.shared = arrays.time, arrays.single if shared is None else shared
-    inputs = [arrays.keyed, clock, wp.float64(offset), wp.float64(substep)]
+    sharing = arrays.single if shared is None else shared
+    inputs = [arrays.keyed, arrays.time, sharing, wp.float64(offset), wp.float64(substep)]
     outputs, device = [arrays.addresses], arrays.time.device
     wp.launch(_write_values, dim=len(arrays.targets), inputs=inputs, outputs=outputs, device=device)

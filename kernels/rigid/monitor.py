@@ -40,16 +40,14 @@ COUNT_CAPACITIES = 4
 
 NO_BODY = 2**31 - 1
 
-STAGES = 3
-"""Stages with a timer: induction, forces, rigid bodies."""
+STAGES = 3  # stages with a timer: induction, forces, rigid bodies
 INDUCTION, FORCE, RIGID = range(STAGES)
 
 UNCONSTRAINED_WEIGHT = 0.25
 """Weight of a single body's motion relative to sliding: contacts are detected up to twice its thickness ahead, and two
 bodies may approach each other."""
 
-NEXT_SUBSTEP = -1
-"""Index of the substep after those of an attempt."""
+NEXT_SUBSTEP = -1  # index of the substep after those of an attempt
 
 
 @wp.struct

@@ -46,8 +46,7 @@ def _gather_sources(
 
 def gather_sources(body_q, sources: SourceShapes, frames, strengths):
     """Write the frames of all sources in the world, and their strengths."""
-    outputs = [frames, strengths]
-    wp.launch(_gather_sources, len(frames), inputs=[body_q, sources], outputs=outputs, device=frames.device)
+    wp.launch(_gather_sources, len(frames), [body_q, sources], [frames, strengths], device=frames.device)
 
 
 @wp.kernel
@@ -98,8 +97,7 @@ def _add_reactions(
 def add_reactions(sources: SourceShapes, model, state, frames, wrenches):
     """Add the wrench of each source, about its frame's origin, to that of its body, except for kinematic bodies."""
     inputs = [sources, view_bodies(model, state), frames, wrenches]
-    outputs = [state.body_f]
-    wp.launch(_add_reactions, len(sources.body_list), inputs=inputs, outputs=outputs, device=frames.device)
+    wp.launch(_add_reactions, len(sources.body_list), inputs, [state.body_f], device=frames.device)
 
 
 @wp.kernel
@@ -111,11 +109,6 @@ def _set_strengths(values_in: wp.array[float], shapes_in: wp.array[wp.int32], st
 def set_strengths(values, shapes, strengths):
     """Set the strengths of ``shapes``; ``values`` may have one entry for all."""
     wp.launch(_set_strengths, len(shapes), inputs=[values, shapes], outputs=[strengths], device=shapes.device)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Sites of sensors
-# ---------------------------------------------------------------------------------------------------------------------
 
 
 @wp.struct

@@ -20,8 +20,7 @@ from warpmag.kernels.rigid.monitor import STAGES, read_clock
 
 wp.set_module_options({"enable_backward": False})
 
-LEVELS = 5
-"""Number of lengths of substeps, each half the one before."""
+LEVELS = 5  # number of lengths of substeps, each half the one before
 
 FLAG_ATTEMPT = 0  # the step must be attempted (again)
 FLAG_REJECTED = 1  # the last attempt was rejected
@@ -40,10 +39,8 @@ STATUS_REGROWN = 6  # 1 if buffers grew since the last step; set by the host
 STATUS_SHARING = 7  # number of substeps that share forces beyond the first level, a power of two
 STATUSES = 8
 
-RUNNING, OVERFLOW, NOT_FINITE, PAUSED = range(4)
-"""Values of ``STATUS_HALT``; the host sets ``PAUSED``."""
-_WORDS_PER_THREAD = 16
-"""Words of a state that a thread copies."""
+RUNNING, OVERFLOW, NOT_FINITE, PAUSED = range(4)  # values of ``STATUS_HALT``; the host sets ``PAUSED``
+_WORDS_PER_THREAD = 16  # words of a state that a thread copies
 
 LOG_SUBSTEPS, LOG_ATTEMPTS, LOG_CAPPED, LOG_REGROWN, LOG_EVALUATIONS, LOG_UNCONVERGED = range(6)
 """First entries of a record. ``LOG_CAPPED`` is 1 if the motion exceeded its limit although substeps were shortest."""
@@ -168,10 +165,7 @@ def _write_time(a: StepArrays, step: wp.float64, longest: wp.float64, time_out: 
 
 @wp.func
 def _sharing_substeps(level: int, long_travel: float, travel_level: int, limit: float) -> int:
-    """Return the number of substeps of ``level`` that share forces.
-
-    ``long_travel`` is the motion in twice the length of a substep of ``travel_level``.
-    """
+    """Return the number of substeps of ``level`` that share forces, from the motion in two of ``travel_level``."""
     count = 1 << level
     travel = 0.5 * long_travel * float(1 << travel_level)
     while count > 2 and not travel <= limit:

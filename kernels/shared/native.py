@@ -10,10 +10,8 @@ from pathlib import Path
 
 import warp as wp
 
-CHUNK = 16
-"""Lanes of the widest vectors of a CPU; as in ``lanes.h``. Arrays of balls are padded to a multiple of it."""
-LINE = 16
-"""Numbers in a ball's cache line; as in ``lanes.h``. Transposing lines into vectors is faster than gathering."""
+CHUNK = 16  # lanes of the widest vectors of a CPU; as in ``lanes.h``. Arrays of balls are padded to a multiple of it
+LINE = 16  # numbers in a ball's cache line; as in ``lanes.h``. Transposing lines into vectors is faster than gathering
 PASS_ARGUMENTS = {"first": int, "last": int, "threads": int, "team": wp.array2d[wp.uint64]}
 """Arguments of a kernel that makes passes ``first`` to ``last`` − 1 over balls, before the struct of its arrays.
 

@@ -5,8 +5,7 @@ from typing import Any
 
 import warp as wp
 
-_GROUP_THREADS = 8
-"""Threads of a GPU that share the neighbors of a moment; a power of two, at most a warp."""
+_GROUP_THREADS = 8  # threads of a GPU that share the neighbors of a moment; a power of two, at most a warp
 
 
 def group_threads(device) -> int:
@@ -51,4 +50,3 @@ def block_max(value: Any):
 """)
 def fence():
     """Make earlier writes of a thread visible to other blocks before its later writes."""
-    ...

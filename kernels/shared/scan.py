@@ -28,6 +28,5 @@ def launch_scan(values, sums, inclusive: bool = True):
 
     A value is part of its own sum if ``inclusive``.
     """
-    wp.launch_tiled(
-        _scan, dim=1, inputs=[values, int(inclusive)], outputs=[sums], block_dim=_BLOCK, device=values.device
-    )
+    inputs, device = [values, int(inclusive)], values.device
+    wp.launch_tiled(_scan, dim=1, inputs=inputs, outputs=[sums], block_dim=_BLOCK, device=device)

@@ -23,8 +23,7 @@ import warp as wp
 from warpmag.kernels.shared.cores import cores
 from warpmag.kernels.shared.native import native_kernel
 
-MOST_THREADS = 64
-"""Most threads per launch; as in ``team.h``."""
+MOST_THREADS = 64  # most threads per launch; as in ``team.h``
 MOMENTS_PER_THREAD = 2500
 """Moments per thread, at least, in a pass over moments and their neighbors: 0.1 to 0.2 ms of work."""
 _STATE, _WORDS = 0, 24

@@ -399,7 +399,7 @@ class MomentSystem:
             self._inducible_field.launch()
         else:
             near_pairs.launch_sweeps(near)
-            self._inducible_field.launch(wait=lambda: near_pairs.wait_for_field(near))
+            self._inducible_field.launch(wait=lambda: near_pairs.wait(near, for_field=True))
 
     def _wait_for_near_contacts(self):
         """Make later launches wait for the near contacts, which run on a stream of their own."""

@@ -84,7 +84,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
 
     def persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays that the next substep depends on, by name."""
-        return {} if self._solve is None else self._solve.carried()
+        return {} if self._solve is None else self._solve.persistent_arrays()
 
     def _step_bodies(self, state_in, state_out, control, contacts, dt) -> None:
         assert self._solve is not None

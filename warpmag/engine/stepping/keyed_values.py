@@ -12,7 +12,7 @@ from warpmag.declarations.keys import Keys, SceneKeys
 from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.errors import InputError
-from warpmag.kernels.rigid.keyed_poses import pose_bodies, write_keyed_poses
+from warpmag.kernels.rigid.keyed_poses import keyed_poses, write_keyed_poses
 from warpmag.kernels.rigid.keys import keyed_arrays, write_keyed_values
 from warpmag.moments.arrays import host_array
 
@@ -33,7 +33,7 @@ class KeyedModelValues:
         self._bodies = None
         if keys.motions:
             operations = {body: motion.operations for body, motion in keys.motions.items()}
-            self._bodies = pose_bodies(operations, _free_joints(model, list(operations)), model, self.time)
+            self._bodies = keyed_poses(operations, _free_joints(model, list(operations)), model, self.time)
         attributes = getattr(model, NAMESPACE)
         curves = [*keys.magnetizations.values(), *keys.currents.values()]
         targets = [attributes.magnetization[shape : shape + 1] for shape in keys.magnetizations]
