@@ -10,7 +10,7 @@
 
 namespace warpmag {
 
-enum EddyPass { RATES, FIELDS, EDDY_PASSES }; // as in eddy.py
+enum EddyPass { RATES, FIELDS }; // as in eddy.py
 // Squared norm Σ t_kl².
 CUDA_CALLABLE inline Number square(const Symmetric& t) {
     return t.xx * t.xx + t.yy * t.yy + t.zz * t.zz + 2 * (t.xy * t.xy + t.yz * t.yz + t.zx * t.zx);
@@ -27,10 +27,11 @@ CUDA_CALLABLE inline void add(Symmetric& total, const Symmetric& t) {
 }
 
 // Table with a column for each moment.
-struct Columns {
+struct MomentColumns {
     const Real* data;
     size_t pitch;
-    CUDA_CALLABLE Columns(const wp::array_t<Real>& rows) : data(rows.data), pitch(rows.strides[0] / sizeof(Real)) {}
+    CUDA_CALLABLE MomentColumns(const wp::array_t<Real>& rows)
+        : data(rows.data), pitch(rows.strides[0] / sizeof(Real)) {}
     CUDA_CALLABLE Real at(int row, int j) const { return data[row * pitch + j]; }
     CUDA_CALLABLE Number own(int row, const int* i) const { return gather(data + row * pitch, i); }
     CUDA_CALLABLE Vector own_three(int row, const int* i) const {
@@ -50,8 +51,8 @@ struct FieldAtBall {
 };
 // Adds source j to the field at balls that move with ``velocity``. With w = ω_j × m_j the rate of 4πH is
 // ∇(4πH) (v − v_j) + 4πH of w.
-CUDA_CALLABLE inline void add_source(FieldAtBall& at_ball, const Columns& packed, const Columns& motion, int j,
-                                     Vector x, Number radius, Vector velocity, Mask active) {
+CUDA_CALLABLE inline void add_source(FieldAtBall& at_ball, const MomentColumns& packed, const MomentColumns& motion,
+                                     int j, Vector x, Number radius, Vector velocity, Mask active) {
     const Number zero = Number(Real(0)), other = zero + packed.at(3, j), s = radius + other, s2 = s * s;
     const Vector r = x - packed.three(0, j), m = packed.three(4, j), w = cross(motion.three(3, j), m);
     const Number d2 = dot(r, r), c = larger(d2, s2);
@@ -78,7 +79,7 @@ CUDA_CALLABLE inline void add_source(FieldAtBall& at_ball, const Columns& packed
 template <class Arrays> CUDA_CALLABLE inline void rates_at(const Arrays& arrays, int slot) {
     const auto& chunk = arrays.chunk.data[slot / CHUNK]; // number of balls, range of sources in their world
     if (slot % CHUNK >= chunk[0]) return;
-    const Columns packed(arrays.packed), motion(arrays.motion);
+    const MomentColumns packed(arrays.packed), motion(arrays.motion);
     const int* const own = arrays.ball.data + slot;
     const Number zero = Number(Real(0)), radius = packed.own(3, own), label = packed.own(7, own);
     const Vector zeros = {zero, zero, zero}, x = packed.own_three(0, own), velocity = motion.own_three(0, own);
@@ -99,7 +100,7 @@ template <class Arrays> CUDA_CALLABLE inline void rates_at(const Arrays& arrays,
 template <class Arrays> CUDA_CALLABLE inline void fields_at(const Arrays& arrays, int slot) {
     const auto& chunk = arrays.torque_chunk.data[slot / CHUNK]; // number of balls, range of conductors in their world
     if (slot % CHUNK >= chunk[0]) return;
-    const Columns packed(arrays.packed), eddy(arrays.eddy);
+    const MomentColumns packed(arrays.packed), eddy(arrays.eddy);
     const int* const own = arrays.torque_ball.data + slot;
     const Number zero = Number(Real(0)), radius = packed.own(3, own), label = packed.own(7, own);
     const Vector x = packed.own_three(0, own);

@@ -80,19 +80,19 @@ def _transform_at(poses: KeyedPoses, o: int, time: wp.float64) -> wp.mat44d:
             for j in range(4):
                 matrix[i, j] = keys.interpolate_number(poses.keyed, o, key, fraction, 4 * j + i)
         return matrix
-    zero, one = wp.vec3d(), wp.vec3d(wp.float64(1.0))
+    zero, unscaled = wp.vec3d(), wp.vec3d(wp.float64(1.0))
     if kind == _ORIENT:
-        return wp.transform_compose(zero, keys.interpolate_quaternion(poses.keyed, o, key, fraction), one)
+        return wp.transform_compose(zero, keys.interpolate_quaternion(poses.keyed, o, key, fraction), unscaled)
     values = wp.vec3d()
     for i in range(3):
         values[i] = keys.interpolate_number(poses.keyed, o, key, fraction, i)
     if kind == _TRANSLATE:
-        return wp.transform_compose(values, wp.quat_identity(dtype=wp.float64), one)
+        return wp.transform_compose(values, wp.quat_identity(dtype=wp.float64), unscaled)
     if kind == _SCALE:
         for i in range(3):
             matrix[i, i] = values[i]
         return matrix
-    return wp.transform_compose(zero, _euler_rotation(kind - _ROTATE, values), one)
+    return wp.transform_compose(zero, _euler_rotation(kind - _ROTATE, values), unscaled)
 
 
 @wp.func
