@@ -33,9 +33,8 @@ class SolidMagnet:
     closed form has the magnetization of a ball by the remanence alone.
     """
 
-    # First moment, and number of moments.
-    first: int
-    count: int
+    first: int  # first moment
+    count: int  # number of moments
     volume: float  # volume of the first moment [m³]
     world: int  # its world
     reach: float  # distance up to which the closed form is used [m]

@@ -53,23 +53,19 @@ class BroadPhaseArrays:
     """Arrays of the broad phase, for s shapes, of which t targets can collide: b balls, then o others."""
 
     # Model:
-    # Bounding boxes of the shapes, enlarged by the detection distance of contacts [m], shape [s].
-    lower: wp.array[wp.vec3]
+    lower: wp.array[wp.vec3]  # corners of the boxes around shapes, enlarged by the detection distance [m], shape [s]
     upper: wp.array[wp.vec3]
     displacement: wp.array[wp.vec3]  # displacement of the shapes in the substep [m], shape [s], or empty
-    # Collision group, world and body of the shapes, shape [s].
-    group: wp.array[int]
-    world: wp.array[int]
-    body: wp.array[int]
+    group: wp.array[int]  # collision group of each shape, shape [s]
+    world: wp.array[int]  # its world
+    body: wp.array[int]  # its body
     kind: wp.array[int]  # index of each shape's type in ``PARTNERS``, or ``len(PARTNERS)`` for other types, shape [s]
     # Radius of balls and capsules, half length of capsules, half extents of boxes [m], shape [s].
     scale: wp.array[wp.vec3]
-    # Distance of each surface from the shape, and detection distance of contacts [m], shape [s].
-    margin: wp.array[float]
-    gap: wp.array[float]
-    # Pose of the shapes in the world and in their bodies, shape [s].
-    frame: wp.array[wp.transform]
-    placement: wp.array[wp.transform]
+    margin: wp.array[float]  # distance of each surface from the shape [m], shape [s]
+    gap: wp.array[float]  # detection distance of contacts [m], shape [s]
+    frame: wp.array[wp.transform]  # pose of each shape in the world, shape [s]
+    placement: wp.array[wp.transform]  # its pose in its body
     body_qd: wp.array[wp.spatial_vector]  # velocities of the bodies, see ``BodyView``
     dt: float  # length of the substep [s]
     body_flags: wp.array[int]  # Newton's flags of the bodies
@@ -88,14 +84,13 @@ class BroadPhaseArrays:
     lists: _lists_type
     boxes: wp.array2d[float]  # swept boxes of the others, lower then upper [m], shape [6, o padded]
     bounds: wp.array2d[float]  # CPU: bounding box of each vector of swept boxes, shape [6, o / 16 padded]
-    # CPU: numbers of pairs and contacts of each chunk of targets, and the results, shape [chunks, 2 + RESULT_SIZE
-    # RESULTS].
+    # CPU: numbers of pairs and contacts of each chunk of targets, and the results, shape
+    # [chunks, 2 + RESULT_SIZE RESULTS].
     results: wp.array2d[int]
     # Data out:
-    # Out, the pairs and their number, which may exceed the capacity.
     pairs: wp.array[wp.vec2i]
-    pair_count: wp.array[int]
-    contacts: ContactView  # out, contacts of balls; Newton appends its own
+    pair_count: wp.array[int]  # number of pairs, which may exceed the capacity, shape [1]
+    contacts: ContactView  # contacts of balls; Newton appends its own
 
 
 @dataclass(frozen=True)

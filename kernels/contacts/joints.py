@@ -51,8 +51,7 @@ class JointView:
     one_axis: wp.array[wp.bool]  # true if the joint rotates about or slides along one axis, shape [joints]
     # Degrees of freedom:
     dof_start: wp.array[wp.int32]  # first degree of freedom, and the one after the last, shape [joints + 1]
-    # Limits of each degree of freedom [m or rad], shape [dofs].
-    lower: wp.array[float]
+    lower: wp.array[float]  # limits of each degree of freedom [m or rad], shape [dofs]
     upper: wp.array[float]
     axis: wp.array[wp.vec3]  # direction of each degree of freedom in the frame of the joint, shape [dofs]
     stiffness: wp.array[float]  # gain of the position [N/m or N·m/rad], shape [dofs]

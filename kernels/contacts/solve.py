@@ -57,8 +57,7 @@ class SolveArrays:
     second bodies, as [P / CHUNK, numbers, CHUNK]. A GPU holds both sides, ordered by body.
     """
 
-    # sizes
-    # c, b and l.
+    # sizes: c, b and l
     contact_max: int
     body_count: int
     line_count: int
@@ -90,9 +89,8 @@ class SolveArrays:
     # GPU: numbers of bodies and sides that take part, of immovable, wide and unsolved bodies, and 1 if a contact has
     # friction, shape [6]. Launches solve the bodies that a cluster leaves unsolved.
     totals: wp.uint64
-    # Number of sides of each body, and (GPU) of those listed so far, shape [b].
-    side_count: wp.uint64
-    filled: wp.uint64
+    side_count: wp.uint64  # number of sides of each body, shape [b]
+    filled: wp.uint64  # GPU: number of those that are listed so far, shape [b]
     slot: wp.uint64  # line of each body, shape [b]
     body: wp.uint64  # body of each line, -1 for the world, shape [l]
     range: wp.uint64  # first of the sides of a line's body, and the one after the last, shape [l, 2]
@@ -103,22 +101,19 @@ class SolveArrays:
     quiet: wp.uint64  # CPU: 1 for each vector of contacts whose records are zero, shape [P / CHUNK]
     wide: wp.uint64  # GPU: lines of wide bodies, shape [b]
     world_first: wp.uint64  # first body of each world that has a block, and the one after the last, shape [worlds + 1]
-    # First of the sides of each body in the last substep, and the one after the last, shape [b, 2].
-    kept_range: wp.uint64
+    kept_range: wp.uint64  # range of the sides of each body in the last substep, shape [b, 2]
     key: wp.uint64  # GPU: shapes of each side, shape [2P]
-    kept_key: wp.uint64  # shapes of the kept sides, shape [2P]
-    # Lines of velocities, inverse masses and inertias, before and (GPU) after an iteration, shape [l, LINE].
-    motion: wp.uint64
-    next_motion: wp.uint64
+    kept_key: wp.uint64  # shapes of the sides in the last substep, shape [2P]
+    motion: wp.uint64  # lines of velocities, inverse masses and inertias before an iteration, shape [l, LINE]
+    next_motion: wp.uint64  # GPU: the same after the iteration
     pose: wp.uint64  # lines of centers of mass and orientations before the substep, shape [l, LINE]
-    # Contacts of ``contact_law.h``: on a GPU prepared, shape [2P, LINE]; on a CPU detected, then prepared.
-    side: wp.uint64
+    side: wp.uint64  # contacts of ``contact_law.h``: GPU: prepared, shape [2P, LINE]; CPU: detected, then prepared
     return_velocity: wp.uint64  # return velocity of each side, shape [2P, 8]; on a CPU first its slip
     impulse: wp.uint64  # accumulated impulse of each side, shape [2P, 12]
-    # CPU: impulse of an iteration on each side, by body, and one for the immovable bodies of each vector, shape [2P + P
-    # / CHUNK, 8].
+    # CPU: impulse of an iteration on each side, by body, and one for the immovable bodies of each vector, shape
+    # [2P + P / CHUNK, 8].
     record: wp.uint64
-    kept: wp.uint64  # their slip [m, rad], and point on the body of the first shape [m], shape [2P, 9]
+    kept: wp.uint64  # their slip [m, rad], and their point on the body of the first shape [m], shape [2P, 9]
 
 
 @dataclass(frozen=True)
@@ -126,8 +121,7 @@ class SolveBuffers:
     """Buffers of the solver on a device."""
 
     arrays: Any  # the :class:`SolveArrays` that kernels read
-    # The arrays that belong to the solver, by name; ``counters`` has ``totals``, ``side_count`` and ``filled``.
-    work: dict[str, wp.array]
+    work: dict[str, wp.array]  # arrays of the solver; ``counters`` has ``totals``, ``side_count`` and ``filled``
     round: bool  # true if every body has the same inertia about all axes
     group: int  # threads of a GPU that share a body, 0 on a CPU
     cluster: int  # blocks of a GPU's cluster, which lists the contacts and solves small scenes; 0 for launches

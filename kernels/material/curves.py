@@ -52,8 +52,7 @@ class CurveParameters:
     inducible: wp.array  # 1 for inducible moments, 0 for permanent ones, shape [n]
     saturation: wp.array  # saturation magnetization Ms [A/m], shape [n]
     slope: wp.array  # slope k = 3χ/(3+χ) [dimensionless], the largest of the curve, shape [n]
-    # Curve id, one of ``CURVE_IDS``, or ``FIRST_TABLE`` + i for measured curve i of ``tables``, shape [n].
-    curve: wp.array
+    curve: wp.array  # id, one of ``CURVE_IDS``, or ``FIRST_TABLE`` + i for measured curve i of ``tables``, shape [n]
     common_curve: int  # common curve id of all inducible moments, or ``MIXED``
     tables: wp.array  # measured curves (:func:`curve_tables`)
 

@@ -29,13 +29,10 @@ class BodyMoments:
     local_positions: wp.array[wp.vec3]  # position in the body's frame [m], shape [n]
     volumes: wp.array[float]  # volume of each moment [m³], shape [n]
     shape: wp.array[wp.int32]  # shape of each moment, shape [n]
-    # Frame of each shape in its body's frame, and its permanent magnetization in the shape's frame [A/m]: arrays of the
-    # model, shape [shapes].
-    shape_frames: wp.array[wp.transform]
-    magnetizations: wp.array[wp.vec3]
-    # Bodies with moments, and the first run of each, shape [b] and [b + 1].
-    body_list: wp.array[wp.int32]
-    body_run_start: wp.array[wp.int32]
+    shape_frames: wp.array[wp.transform]  # frame of each shape in its body, an array of the model, shape [shapes]
+    magnetizations: wp.array[wp.vec3]  # permanent magnetization in the shape's frame [A/m], likewise
+    body_list: wp.array[wp.int32]  # bodies with moments, shape [b]
+    body_run_start: wp.array[wp.int32]  # first run of each of them, shape [b + 1]
     runs: wp.array[wp.vec2i]  # first moment of each run, and the index after its last, shape [r]
     kinematic_flag: int  # Newton's flag of bodies that forces do not move
 

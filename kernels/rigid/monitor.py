@@ -57,17 +57,14 @@ class Monitor:
     # Distance that a body may move before it can pass through another [m], the radius of a ball; infinite for bodies
     # that forces do not move. Shape [body_count].
     thickness: wp.array[float]
-    # Largest displacement of a body's surface per radian [m], zero for a ball. Shape [body_count].
-    reach: wp.array[float]
-    # Addresses of the number of used entries of each buffer; 0 for buffers of :func:`watch_flags`.
-    fill_counts: wp.array[wp.uint64]
+    reach: wp.array[float]  # largest displacement of a body's surface per radian [m], zero for a ball, [body_count]
+    fill_counts: wp.array[wp.uint64]  # addresses of each buffer's number of used entries; 0 for :func:`watch_flags`
     level: wp.array[wp.int32]  # number of times that substeps were halved, shape [1]
     substeps: wp.array[wp.int32]  # number of completed substeps of this attempt, shape [1]
     # Time of each stage since the last accepted step, then the clock at the last mark; nanoseconds on a GPU, clock
     # cycles on a CPU.
     ticks: wp.array[wp.uint64]
-    # See the module's docstring.
-    peaks: wp.array[float]
+    peaks: wp.array[float]  # see the module's docstring, as for ``counts``
     counts: wp.array[wp.int32]
 
 

@@ -29,23 +29,18 @@ class ContactView:
     """Contacts of rigid bodies, and their shapes."""
 
     count: wp.array[wp.int32]  # number of contacts, more than ``contact_max`` if some were dropped, shape [1]
-    # Shapes of each contact, shape [contact_max].
-    shape0: wp.array[wp.int32]
+    shape0: wp.array[wp.int32]  # shapes of each contact, shape [contact_max]
     shape1: wp.array[wp.int32]
-    # Contact points in the frames of the two bodies [m], shape [contact_max].
-    point0: wp.array[wp.vec3]
+    point0: wp.array[wp.vec3]  # contact points in the frames of the two bodies [m], shape [contact_max]
     point1: wp.array[wp.vec3]
-    # Vectors from the contact points to the surfaces, in those frames [m], shape [contact_max].
-    offset0: wp.array[wp.vec3]
+    offset0: wp.array[wp.vec3]  # vectors from the points to the surfaces, in those frames [m], shape [contact_max]
     offset1: wp.array[wp.vec3]
-    # Distance of the surface from each point [m], shape [contact_max].
-    margin0: wp.array[float]
+    margin0: wp.array[float]  # distance of the surface from each point [m], shape [contact_max]
     margin1: wp.array[float]
     normal: wp.array[wp.vec3]  # unit vector from the first shape to the second, shape [contact_max]
     shape_body: wp.array[wp.int32]  # body of each shape, -1 for the world, shape [shapes]
     shape_gap: wp.array[float]  # distance up to which contacts are detected [m], shape [shapes]
-    # Coefficients of friction of each shape, shape [shapes].
-    mu: wp.array[float]
+    mu: wp.array[float]  # coefficients of friction of each shape, shape [shapes]
     mu_torsional: wp.array[float]
     mu_rolling: wp.array[float]
 

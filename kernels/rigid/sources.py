@@ -12,13 +12,11 @@ class SourceShapes:
     """Shapes of s sources of fields, on b bodies."""
 
     shape: wp.array[wp.int32]  # shape of each source, shape [s]
-    # Body of each shape, and its frame in that body's frame: arrays of the model, shape [shapes].
-    shape_body: wp.array[wp.int32]
-    shape_frames: wp.array[wp.transform]
+    shape_body: wp.array[wp.int32]  # body of each shape, an array of the model, shape [shapes]
+    shape_frames: wp.array[wp.transform]  # frame of each shape in its body, likewise
     strengths: wp.array[float]  # strength of each shape, an array of the model, shape [shapes]
-    # Bodies with sources, and the first source of each in ``order``, shape [b] and [b + 1].
-    body_list: wp.array[wp.int32]
-    run_start: wp.array[wp.int32]
+    body_list: wp.array[wp.int32]  # bodies with sources, shape [b]
+    run_start: wp.array[wp.int32]  # first source of each of them in ``order``, shape [b + 1]
     order: wp.array[wp.int32]  # sources sorted by body
     kinematic_flag: int  # Newton's flag of bodies that forces do not move
 
@@ -116,9 +114,8 @@ class Sites:
     """Sites of s sensors."""
 
     shape: wp.array[wp.int32]  # shape of each site, shape [s]
-    # Body of each shape, and its frame in that body's frame: arrays of the model, shape [shapes].
-    shape_body: wp.array[wp.int32]
-    shape_frames: wp.array[wp.transform]
+    shape_body: wp.array[wp.int32]  # body of each shape, an array of the model, shape [shapes]
+    shape_frames: wp.array[wp.transform]  # frame of each shape in its body, likewise
 
 
 @wp.func
