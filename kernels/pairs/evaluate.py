@@ -25,6 +25,7 @@ from warpmag.kernels.pairs import fused_cuda, mirror_cuda, sums_cuda, work_list
 from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI, WIDTHS, Quantity
 from warpmag.kernels.pairs.reference import launch_reference_sums
+from warpmag.kernels.pairs.work_list import PAIRS_PER_THREAD
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
@@ -153,7 +154,7 @@ class PairEvaluation:
         if self.form != FUSED:
             finish = _finish_kernel(self.partial.dtype, self._finished, group_threads(self.partial.device))
             # the threads that summed are awake, and a row whose overlap list is full visits all its sources
-            self._launch_pass(finish, threads_for(self.pair_count, work_list.PAIRS_PER_THREAD))
+            self._launch_pass(finish, threads_for(self.pair_count, PAIRS_PER_THREAD))
 
     def _launch_pass(self, kernel, threads):
         """Launch a pass over the target rows. The launch is recorded, so that the struct is packed only once."""
