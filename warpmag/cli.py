@@ -23,6 +23,7 @@ _VIEWERS = {"gl": "ViewerGL", "viser": "ViewerViser", "rerun": "ViewerRerun"}
 _BROWSER_VIEWERS = ("viser", "rerun")
 """Viewers in a browser, which show the scene only while the command runs."""
 _OUTPUT_FOLDER = Path("warpmag_out")
+_DEVICE_HELP = "Warp device, cpu or cuda:0 (default: the first GPU, else cpu)"
 
 
 class _Parser(argparse.ArgumentParser):
@@ -112,97 +113,64 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_run(commands) -> None:
     run = commands.add_parser("run", help="simulate a scene and write it as a USD stage")
-    run.add_argument("scene", metavar="SCENE", help="a bundled scene (see 'warpmag scenes') or a USD file")
-    run.add_argument("-o", "--output", metavar="OUT", help="USD file to write (default: warpmag_out/SCENE.usda)")
-    run.add_argument("--balls", type=int, metavar="N", help="number of balls of falling_magnet, sakura_tree or million")
-    run.add_argument(
-        "--frames", type=int, metavar="N", help="output frames to simulate (default: the time range of the stage)"
-    )
-    run.add_argument("--resume", action="store_true", help="continue the run at the output, if there is one")
-    run.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
-    run.add_argument(
-        "--solver", choices=SOLVERS, default=next(iter(SOLVERS)), help="rigid-body solver (default: %(default)s)"
-    )
-    run.add_argument(
-        "--preset",
-        choices=PRESETS,
-        help="force law, dynamics, and curve of all magnets: from this library, Kim and Han 2022, or Kim et al. 2018",
-    )
-    run.add_argument("--force", choices=FORCES, help="force law (default: the stage's)")
-    run.add_argument("--dynamics", choices=DYNAMICS, help="magnetization dynamics (default: the stage's)")
-    run.add_argument(
-        "--contact-model", choices=CONTACT_MODELS, help="model of balls that nearly touch (default: the stage's)"
-    )
-    run.add_argument(
-        "--method",
-        action=_Method,
-        default=METHODS[0],
-        metavar=f"{{{','.join(METHODS)}}}",
-        help="sums by the faster method, over all pairs, or by the fast multipole method (default: %(default)s)",
-    )
-    run.add_argument("--sums", dest="method", action=_Method, default=METHODS[0], help=argparse.SUPPRESS)
-    run.add_argument(
-        "--rtol",
-        type=float,
-        metavar="X",
-        help="relative magnetization error at which induction ends, at least 2e-6 (default: the stage's)",
-    )
-    run.add_argument(
-        "--viewer", choices=("none", *_VIEWERS), default="none", help="viewer that shows the run (default: %(default)s)"
-    )
-    run.add_argument(
-        "--for",
-        dest="purpose",
-        choices=("render",),
-        help="also write a stage for renderers beside the output, as 'warpmag export' does",
-    )
     run.set_defaults(command=_run)
+    add = run.add_argument
+    add("scene", metavar="SCENE", help="a bundled scene (see 'warpmag scenes') or a USD file")
+    add("-o", "--output", metavar="OUT", help="USD file to write (default: warpmag_out/SCENE.usda)")
+    add("--balls", type=int, metavar="N", help="number of balls of falling_magnet, sakura_tree or million")
+    add("--frames", type=int, metavar="N", help="output frames to simulate (default: the time range of the stage)")
+    add("--resume", action="store_true", help="continue the run at the output, if there is one")
+    add("--device", help=_DEVICE_HELP)
+    add("--solver", choices=SOLVERS, default=next(iter(SOLVERS)), help="rigid-body solver (default: %(default)s)")
+    text = "force law, dynamics, and curve of all magnets: from this library, Kim and Han 2022, or Kim et al. 2018"
+    add("--preset", choices=PRESETS, help=text)
+    add("--force", choices=FORCES, help="force law (default: the stage's)")
+    add("--dynamics", choices=DYNAMICS, help="magnetization dynamics (default: the stage's)")
+    add("--contact-model", choices=CONTACT_MODELS, help="model of balls that nearly touch (default: the stage's)")
+    names = f"{{{','.join(METHODS)}}}"
+    text = "sums by the faster method, over all pairs, or by the fast multipole method (default: %(default)s)"
+    add("--method", action=_Method, default=METHODS[0], metavar=names, help=text)
+    add("--sums", dest="method", action=_Method, default=METHODS[0], help=argparse.SUPPRESS)
+    text = "relative magnetization error at which induction ends, at least 2e-6 (default: the stage's)"
+    add("--rtol", type=float, metavar="X", help=text)
+    text = "viewer that shows the run (default: %(default)s)"
+    add("--viewer", choices=("none", *_VIEWERS), default="none", help=text)
+    text = "also write a stage for renderers beside the output, as 'warpmag export' does"
+    add("--for", dest="purpose", choices=("render",), help=text)
 
 
 def _add_render(commands) -> None:
     render = commands.add_parser("render", help="draw frames of a stage or of a finished run")
-    render.add_argument("stage", metavar="STAGE", help="a USD file, or a bundled scene")
-    render.add_argument("-o", "--output", metavar="FILE", required=True, help="picture (.png) or film (.mp4, .gif)")
-    frames = render.add_mutually_exclusive_group()
-    frames.add_argument(
-        "--frame", type=int, metavar="N", help="number of the frame to draw, 0 for the start (default: the last)"
-    )
-    frames.add_argument("--frames", metavar="A:B", help="first and last frame to draw (default for a film: all)")
-    render.add_argument("--size", metavar="WxH", default="960x540", help="width and height [px] (default: %(default)s)")
-    render.add_argument(
-        "--quality",
-        choices=("draft", "final"),
-        default="draft",
-        help="draft, or final by Blender's path tracer (default: %(default)s)",
-    )
-    render.add_argument("--moments", action="store_true", help="draw the moments of a finished run as arrows")
-    render.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
     render.set_defaults(command=_render)
+    add = render.add_argument
+    add("stage", metavar="STAGE", help="a USD file, or a bundled scene")
+    add("-o", "--output", metavar="FILE", required=True, help="picture (.png) or film (.mp4, .gif)")
+    frames = render.add_mutually_exclusive_group()
+    text = "number of the frame to draw, 0 for the start (default: the last)"
+    frames.add_argument("--frame", type=int, metavar="N", help=text)
+    frames.add_argument("--frames", metavar="A:B", help="first and last frame to draw (default for a film: all)")
+    add("--size", metavar="WxH", default="960x540", help="width and height [px] (default: %(default)s)")
+    text = "draft, or final by Blender's path tracer (default: %(default)s)"
+    add("--quality", choices=("draft", "final"), default="draft", help=text)
+    add("--moments", action="store_true", help="draw the moments of a finished run as arrows")
+    add("--device", help=_DEVICE_HELP)
 
 
 def _add_export(commands) -> None:
-    export = commands.add_parser(
-        "export", help="export a scene or a finished run: a stage for renderers, a web page, or numbers"
-    )
-    export.add_argument("stage", metavar="STAGE", help="a USD file, or a bundled scene")
-    export.add_argument(
-        "-o",
-        "--output",
-        metavar="OUT",
-        required=True,
-        help="file: .usda, .usdc or .usdz for renderers, .html for a web page, .npz or .csv for numbers",
-    )
-    export.add_argument(
-        "--rate", type=float, default=24.0, metavar="HZ", help="frames per second (default: %(default)g, as in Blender)"
-    )
-    export.add_argument("--color", metavar="QUANTITY", help="color bodies by magnetization, speed or force")
-    export.add_argument("--arrows", action="store_true", help="draw moments as arrows")
-    export.add_argument(
-        "--field-lines", type=int, default=0, metavar="N", help="draw N field lines of the permanent magnets"
-    )
-    export.add_argument("--materialx", action="store_true", help="also write materials as MaterialX")
-    export.add_argument("--device", help="Warp device, cpu or cuda:0 (default: the first GPU, else cpu)")
+    text = "export a scene or a finished run: a stage for renderers, a web page, or numbers"
+    export = commands.add_parser("export", help=text)
     export.set_defaults(command=_export)
+    add = export.add_argument
+    add("stage", metavar="STAGE", help="a USD file, or a bundled scene")
+    text = "file: .usda, .usdc or .usdz for renderers, .html for a web page, .npz or .csv for numbers"
+    add("-o", "--output", metavar="OUT", required=True, help=text)
+    text = "frames per second (default: %(default)g, as in Blender)"
+    add("--rate", type=float, default=24.0, metavar="HZ", help=text)
+    add("--color", metavar="QUANTITY", help="color bodies by magnetization, speed or force")
+    add("--arrows", action="store_true", help="draw moments as arrows")
+    add("--field-lines", type=int, default=0, metavar="N", help="draw N field lines of the permanent magnets")
+    add("--materialx", action="store_true", help="also write materials as MaterialX")
+    add("--device", help=_DEVICE_HELP)
 
 
 def _scenes(options) -> int:
@@ -249,16 +217,15 @@ def _check(options) -> int:
         step = "not given" if clock.step is None else f"{1e3 * clock.step:g} ms"
         seconds = (clock.end - clock.start) / clock.time_codes_per_second
         print(f"time        {seconds:g} s at {clock.frames_per_second:g} frames per second, physics step {step}")
-    print(
-        f"bodies      {len(contents.bodies)} ({len(contents.kinematic)} kinematic), {len(contents.colliders)} colliders"
-    )
+    bodies, kinematic, colliders = map(len, (contents.bodies, contents.kinematic, contents.colliders))
+    print(f"bodies      {bodies} ({kinematic} kinematic), {colliders} colliders")
     print(f"magnets     {len(report.magnets('inducible'))} inducible, {len(report.magnets('permanent'))} permanent")
     sources = [source for placed in contents.sources.values() for source in placed]
     currents = sum(source.currents is not None for source in sources)
     if contents.motions or contents.magnetization_keys or contents.field_keys or currents:
-        others = f", {currents} currents" if currents else ""
-        others += ", the external field" if contents.field_keys else ""
-        print(f"keyed       {len(contents.motions)} bodies, {len(contents.magnetization_keys)} magnetizations{others}")
+        fields = f", {currents} currents" if currents else ""
+        fields += ", the external field" if contents.field_keys else ""
+        print(f"keyed       {len(contents.motions)} bodies, {len(contents.magnetization_keys)} magnetizations{fields}")
     if sources:
         kinds = [type(source.source).__name__ for source in sources]
         print(f"sources     {kinds.count('Coil')} coils, {kinds.count('FieldMap')} field maps")
@@ -302,21 +269,14 @@ def _render(options) -> int:
 
         if options.frames or options.moments:
             raise InputError("quality: 'final' draws one frame without moments; 'warpmag export --arrows' draws them")
-        print(
-            f"written {render_final(path, options.output, frame=options.frame, size=_pair('size', options.size, 'x'))}"
-        )
+        size = _pair("size", options.size, "x")
+        print(f"written {render_final(path, options.output, frame=options.frame, size=size)}")
         return 0
     from warpmag.show.ray_tracing import render  # noqa: PLC0415
 
-    written = render(
-        path,
-        options.output,
-        frame=options.frame,
-        frames=_pair("frames", options.frames, ":") if options.frames is not None else None,
-        size=_pair("size", options.size, "x"),
-        moments=options.moments,
-        device=options.device,
-    )
+    frames = _pair("frames", options.frames, ":") if options.frames is not None else None
+    settings = {"size": _pair("size", options.size, "x"), "moments": options.moments, "device": options.device}
+    written = render(path, options.output, frame=options.frame, frames=frames, **settings)
     print(f"written {written[0]}{f' to {written[-1].name}' if len(written) > 1 else ''}")
     return 0
 
@@ -366,18 +326,10 @@ def _run(options) -> int:
 def _simulation_of(path: Path, options):
     """Return the simulation that the options describe."""
     preset = PRESETS[options.preset] if options.preset else None
-    return _load(
-        path,
-        solver=options.solver,
-        force=options.force or (preset and preset.force),
-        dynamics=options.dynamics or (preset and preset.dynamics),
-        contact_model=options.contact_model,
-        curve=preset and preset.curve,
-        method=options.method,
-        rtol=options.rtol,
-        device=options.device,
-        visuals=options.viewer != "none",
-    )
+    settings = {name: getattr(options, name) for name in ("solver", "contact_model", "method", "rtol", "device")}
+    settings["force"] = options.force or (preset and preset.force)
+    settings["dynamics"] = options.dynamics or (preset and preset.dynamics)
+    return _load(path, **settings, curve=preset and preset.curve, visuals=options.viewer != "none")
 
 
 def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, resume: bool) -> None:

@@ -25,15 +25,8 @@ class Progress:
         if self._bar is None:
             from tqdm import tqdm  # noqa: PLC0415
 
-            interval = 0.2 if sys.stderr.isatty() else 10.0
-            self._bar = tqdm(
-                total=self.frames,
-                initial=frame,
-                unit="frame",
-                mininterval=interval,
-                file=sys.stderr,
-                dynamic_ncols=True,
-            )
+            style = {"unit": "frame", "mininterval": 0.2 if sys.stderr.isatty() else 10.0, "dynamic_ncols": True}
+            self._bar = tqdm(total=self.frames, initial=frame, file=sys.stderr, **style)
         self._bar.update(frame - self._bar.n)
 
     def close(self) -> None:

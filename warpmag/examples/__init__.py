@@ -94,8 +94,7 @@ def main() -> int:
             print(f"warpmag: {name} needs {extra('sim')}: {reason}", file=sys.stderr)
             return 2
         return 0
-    known = name in (None, "-h", "--help", "--list")
-    if not known:
+    if name not in (None, "-h", "--help", "--list"):
         print(f"warpmag: {name}: no such example, there are {', '.join(examples)}", file=sys.stderr)
         return 2
     print("python -m warpmag.examples NAME [--headless] [--test] [--viewer gl|viser|rerun|usd|null] [--device cuda:0]")

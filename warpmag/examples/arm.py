@@ -18,8 +18,8 @@ RADIUS = 0.005  # m, of the ball
 COIL = {"shape": "solenoid", "radius": 0.015, "length": 0.01, "label": "gripper"}
 AMPERE_TURNS = 2500.0
 STIFFNESS = 2000.0  # N/m, of the slide's drive
-START, END = (0.15, 0.1), (0.12, -0.12)  # m, places where the ball is picked up and put down
-ABOVE, UP = 0.014, 0.03  # m, height of the pad above the ground, and of the lift
+START, END = (0.15, 0.1), (0.12, -0.12)  # m, positions where the ball is picked up and put down
+PAD, LIFT = 0.014, 0.03  # m, height of the pad above the ground, and of the lift
 TIMES = (0.0, 0.3, 0.5, 1.2, 1.4, 1.6)  # s: wait, picked up, lifted, turned, lowered, released
 # MuJoCo's contacts are springs: with Newton's 2500 N/m the pulled ball sinks 0.9 mm into the pad, with this stiffness
 # a hundredth of that. Steps must not exceed 2/sqrt(ke), 4 ms.
@@ -71,14 +71,11 @@ class Example:
         angles = joints_at(*START)
         for angle in angles:
             link = builder.add_link()
-            middle = wp.transform((0.5 * LINK, 0.0, 0.0), wp.quat_identity())
-            builder.add_shape_box(link, xform=middle, hx=0.5 * LINK, hy=0.01, hz=0.005, cfg=light)
-            place = wp.transform((0.0, 0.0, HEIGHT) if parent < 0 else (LINK, 0.0, 0.0), wp.quat_identity())
-            joints.append(
-                builder.add_joint_revolute(
-                    parent, link, parent_xform=place, axis=upright, target_ke=20.0, target_kd=0.5, target_q=angle
-                )
-            )
+            center = wp.transform((0.5 * LINK, 0.0, 0.0), wp.quat_identity())
+            builder.add_shape_box(link, xform=center, hx=0.5 * LINK, hy=0.01, hz=0.005, cfg=light)
+            end = wp.transform((0.0, 0.0, HEIGHT) if parent < 0 else (LINK, 0.0, 0.0), wp.quat_identity())
+            drive = {"target_ke": 20.0, "target_kd": 0.5, "target_q": angle}
+            joints.append(builder.add_joint_revolute(parent, link, parent_xform=end, axis=upright, **drive))
             builder.joint_q[-1] = angle
             parent = link
         slide = builder.add_link()
@@ -88,12 +85,9 @@ class Example:
         winding = newton.ModelBuilder.ShapeConfig(density=2000.0, has_shape_collision=False)
         builder.add_shape_cylinder(slide, xform=coil, radius=COIL["radius"], half_height=0.005, cfg=winding)
         warpmag.add_coil(builder, slide, xform=coil, **COIL)
-        below = wp.transform((LINK, 0.0, ABOVE + 0.0005 - HEIGHT), wp.quat_identity())
-        joints.append(
-            builder.add_joint_prismatic(
-                parent, slide, parent_xform=below, axis=upright, target_ke=STIFFNESS, target_kd=20.0
-            )
-        )
+        end = wp.transform((LINK, 0.0, PAD + 0.0005 - HEIGHT), wp.quat_identity())
+        drive = {"target_ke": STIFFNESS, "target_kd": 20.0}
+        joints.append(builder.add_joint_prismatic(parent, slide, parent_xform=end, axis=upright, **drive))
         builder.add_articulation(joints)
         return slide
 
@@ -113,9 +107,9 @@ class Example:
     def step(self):
         """Advance by a frame of 12 ms."""
         start, end = joints_at(*START), joints_at(*END)
-        height = np.interp(self.time, TIMES, (0.0, 0.0, UP, UP, 0.0, 0.0))
-        turned = 0.5 - 0.5 * math.cos(math.pi * np.interp(self.time, TIMES, (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)))
-        self.targets[:3] = *((1.0 - turned) * np.array(start) + turned * np.array(end)), height
+        height = np.interp(self.time, TIMES, (0.0, 0.0, LIFT, LIFT, 0.0, 0.0))
+        fraction = 0.5 - 0.5 * math.cos(math.pi * np.interp(self.time, TIMES, (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)))
+        self.targets[:3] = *((1.0 - fraction) * np.array(start) + fraction * np.array(end)), height
         self.control.joint_target_q.assign(self.targets)
         self.magnetics.set_current("gripper", AMPERE_TURNS if 0.2 <= self.time < TIMES[-1] else 0.0)
         if self.graph:
@@ -123,13 +117,14 @@ class Example:
         else:
             self.simulate()
         self.time += 0.012
-        self.loads.append((self.time, STIFFNESS * (height - self.state_0.joint_q.numpy()[2]), self.place()[2]))
+        load = STIFFNESS * (height - self.state_0.joint_q.numpy()[2])
+        self.loads.append((self.time, load, self.ball_position()[2]))
 
     def render(self):
         """Show the arm and the ball."""
         self.display.show(self.time, self.state_0)
 
-    def place(self) -> np.ndarray:
+    def ball_position(self) -> np.ndarray:
         """Return the position of the ball [m]."""
         return self.state_0.body_q.numpy()[self.ball, :3].astype(float)
 
@@ -140,20 +135,20 @@ class Example:
 
     def test_final(self):
         """Check that the ball was lifted, loaded the arm with its weight, lies at the end, and penetrated nothing."""
-        assert max(height for *_, height in self.loads) > UP
+        assert max(height for *_, height in self.loads) > LIFT
         weight = 9.81 * float(self.model.body_mass.numpy()[self.ball])
         np.testing.assert_allclose(self.held_weight(), weight, rtol=0.02)
-        place = self.place()
-        np.testing.assert_allclose(place[:2], END, atol=1e-3)
-        np.testing.assert_allclose(place[2], RADIUS, atol=5e-5)
+        position = self.ball_position()
+        np.testing.assert_allclose(position[:2], END, atol=1e-3)
+        np.testing.assert_allclose(position[2], RADIUS, atol=5e-5)
         assert min(height for *_, height in self.loads) > 0.98 * RADIUS
 
     def summary(self) -> str:
         """Return the result in one line."""
-        off = 1e3 * np.linalg.norm(self.place()[:2] - END)
+        error = 1e3 * np.linalg.norm(self.ball_position()[:2] - END)
         weight = 9.81 * float(self.model.body_mass.numpy()[self.ball])
         held = 1e3 * self.held_weight()
-        return f"put down {off:.2g} mm off; the arm carried {held:.2f} mN, the ball weighs {1e3 * weight:.2f} mN"
+        return f"put down {error:.2g} mm off; the arm carried {held:.2f} mN, the ball weighs {1e3 * weight:.2f} mN"
 
 
 if __name__ == "__main__":

@@ -26,9 +26,8 @@ class Example:
         iron = newton.ModelBuilder.ShapeConfig(density=7870.0, mu=0.0)
         builder.add_ground_plane(cfg=iron)
         for x, y, z in np.ndindex(args.columns, args.columns, args.layers):
-            side = 2.005 * RADIUS * (np.array((x, y)) - 0.5 * (args.columns - 1))
-            place = wp.transform((*side, (2.005 * z + 1.0) * RADIUS), wp.quat_identity())
-            ball = builder.add_body(xform=place)
+            center = 2.005 * RADIUS * (np.array((x, y)) - 0.5 * (args.columns - 1))
+            ball = builder.add_body(xform=wp.transform((*center, (2.005 * z + 1.0) * RADIUS), wp.quat_identity()))
             builder.add_shape_sphere(ball, radius=RADIUS, cfg=iron)
             warpmag.add_inducible(builder, ball, saturation=1.7e6)
         above = wp.transform((0.0, 0.0, HEIGHT), wp.quat_identity())

@@ -35,8 +35,8 @@ class Example:
         )  # fmt: skip
         builder.add_articulation([motor])
         for number in range(args.balls):
-            behind = HALF_LENGTH + (2 * number + 1) * 1.001 * RADIUS
-            ball = builder.add_body(xform=wp.transform((ARM, -behind, RADIUS), wp.quat_identity()))
+            distance = HALF_LENGTH + (2 * number + 1) * 1.001 * RADIUS
+            ball = builder.add_body(xform=wp.transform((ARM, -distance, RADIUS), wp.quat_identity()))
             builder.add_shape_sphere(ball, radius=RADIUS, cfg=smooth)
             warpmag.add_permanent(builder, ball, magnetization=(0.0, 2e5, 0.0))
 
@@ -66,10 +66,10 @@ class Example:
     def friction_torque(self) -> float:
         """Return the torque of Coulomb friction, opposite to slip velocities, under all balls about the axis [N·m]."""
         state, weights = self.simulation.state, 9.81 * self.simulation.model.body_mass.numpy()[1:]
-        places, speeds = state.body_q.numpy()[1:, :2].astype(float), state.body_qd.numpy()[1:].astype(float)
-        slip = speeds[:, :2] + RADIUS * np.stack([-speeds[:, 4], speeds[:, 3]], axis=1)
+        x, velocities = state.body_q.numpy()[1:, :2].astype(float), state.body_qd.numpy()[1:].astype(float)
+        slip = velocities[:, :2] + RADIUS * np.stack([-velocities[:, 4], velocities[:, 3]], axis=1)
         slip /= np.linalg.norm(slip, axis=1, keepdims=True)
-        return float(FRICTION * weights @ (places[:, 0] * slip[:, 1] - places[:, 1] * slip[:, 0]))
+        return float(FRICTION * weights @ (x[:, 0] * slip[:, 1] - x[:, 1] * slip[:, 0]))
 
     def mean_torques(self) -> tuple[float, float]:
         """Return the torques of the motor and of friction [N·m], means over the second half of the run."""
@@ -83,8 +83,8 @@ class Example:
         np.testing.assert_allclose(np.linalg.norm(links, axis=1), 2.0 * RADIUS, rtol=0.02)
         moments = self.simulation.magnetics.shape_moments()[1:]
         moments /= np.linalg.norm(moments, axis=1, keepdims=True)
-        along = -np.sum(moments[:-1] * links, axis=1) / np.linalg.norm(links, axis=1)
-        assert along.min() > 0.9, f"a ball of the chain points across it, {along}"
+        cosines = -np.sum(moments[:-1] * links, axis=1) / np.linalg.norm(links, axis=1)
+        assert cosines.min() > 0.9, f"a ball of the chain points across it, {cosines}"
         motor, friction = self.mean_torques()
         np.testing.assert_allclose(motor, friction, rtol=0.2)  # the balls swing and touch each other
 

@@ -32,13 +32,13 @@ class Example:
         self.fields = np.linspace(500.0, 2000.0, args.rows)  # A/m
         self.damping = MU0 * MOMENT * 1000.0 / SPEED  # N·m·s: needles begin to slip in 1000 A/m
         for column in range(args.columns):
-            place = wp.transform((column * PITCH, 0.0, 0.0), wp.quat_identity())
-            needle = row.add_link(xform=place)
+            pose = wp.transform((column * PITCH, 0.0, 0.0), wp.quat_identity())
+            needle = row.add_link(xform=pose)
             row.add_shape_box(needle, hx=EXTENT[0], hy=EXTENT[1], hz=EXTENT[2])
             # one moment is enough for needles so far away; the default would be 252
             warpmag.add_permanent(row, needle, magnetization=(MAGNETIZATION, 0.0, 0.0), moment_spacing=2.0 * EXTENT[0])
             hinge = row.add_joint_revolute(
-                -1, needle, parent_xform=place, axis=(0.0, 0.0, 1.0), target_kd=self.damping,
+                -1, needle, parent_xform=pose, axis=(0.0, 0.0, 1.0), target_kd=self.damping,
                 actuator_mode=newton.JointTargetMode.VELOCITY,
             )  # fmt: skip
             row.add_articulation([hinge])
@@ -66,9 +66,9 @@ class Example:
     def step(self):
         """Advance by a frame of 5 ms."""
         for _ in range(10):
-            turned = self.field_angle()
-            along = np.array((math.cos(turned), math.sin(turned), 0.0))
-            self.magnetics.set_external_field(self.fields[:, None] * along)
+            angle = self.field_angle()
+            direction = np.array((math.cos(angle), math.sin(angle), 0.0))
+            self.magnetics.set_external_field(self.fields[:, None] * direction)
             self.simulation.step()
         self.angles.append(self.angle())
 
@@ -81,37 +81,37 @@ class Example:
         q = self.simulation.state.body_q.numpy().astype(float)
         return (2.0 * np.arctan2(q[:, 5], q[:, 6])).reshape(len(self.fields), -1)
 
-    def follow(self) -> tuple[np.ndarray, np.ndarray]:
+    def lags_and_speeds(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the final lag behind the field [rad] and mean speed [rad/s] of the first needle of each row."""
         times = np.linspace(0.0, self.simulation.time, len(self.angles))
-        behind = np.unwrap(SPEED * times[:, None] - np.array(self.angles)[:, :, 0], axis=0)
+        lags = np.unwrap(SPEED * times[:, None] - np.array(self.angles)[:, :, 0], axis=0)
         slips = []
-        for lag in behind.T:
+        for lag in lags.T:
             ends = np.flatnonzero(np.diff(np.floor(lag / (2.0 * math.pi))))
             slips.append(np.polyfit(times[ends], np.arange(len(ends)), 1)[0] if len(ends) > 1 else 0.0)
-        return np.remainder(behind[-1] + math.pi, 2.0 * math.pi) - math.pi, SPEED - 2.0 * math.pi * np.array(slips)
+        return np.remainder(lags[-1] + math.pi, 2.0 * math.pi) - math.pi, SPEED - 2.0 * math.pi * np.array(slips)
 
     def test_final(self):
         """Check the lag of rows in strong fields and the speed of slipping rows against Adler's equation."""
         critical = MU0 * MOMENT * self.fields / self.damping
-        behind, speeds = self.follow()
+        lags, speeds = self.lags_and_speeds()
         locked = critical > 1.05 * SPEED
-        np.testing.assert_allclose(behind[locked], np.arcsin(SPEED / critical[locked]), atol=0.02)
+        np.testing.assert_allclose(lags[locked], np.arcsin(SPEED / critical[locked]), atol=0.02)
         np.testing.assert_array_equal(speeds[locked], SPEED)
         slipping = critical < 0.8 * SPEED
-        slow = SPEED - np.sqrt(SPEED**2 - critical[slipping] ** 2)
-        np.testing.assert_allclose(speeds[slipping], slow, atol=0.05 * SPEED)  # slips are resolved by frames
+        expected = SPEED - np.sqrt(SPEED**2 - critical[slipping] ** 2)
+        np.testing.assert_allclose(speeds[slipping], expected, atol=0.05 * SPEED)  # slips are resolved by frames
         order = np.abs(np.exp(1j * np.array(self.angles[-1])).mean(axis=1))
         assert order.min() > 0.999, f"needles of one row point apart, order {order.min():g}"
 
     def summary(self) -> str:
         """Return the result in one line."""
-        behind, speeds = self.follow()
+        lags, speeds = self.lags_and_speeds()
         follows = speeds > 0.9 * SPEED
-        angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(behind[follows]))
-        parts = ", ".join(f"{part:.2f}" for part in speeds[~follows] / SPEED)
+        angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(lags[follows]))
+        ratios = ", ".join(f"{ratio:.2f}" for ratio in speeds[~follows] / SPEED)
         locked = [f"{follows.sum()} rows follow the field, {angles} degrees behind it"] if angles else []
-        slipping = [f"{(~follows).sum()} slip and turn at {parts} of its speed"] if parts else []
+        slipping = [f"{(~follows).sum()} slip and turn at {ratios} of its speed"] if ratios else []
         return ", ".join([*locked, *slipping])
 
 

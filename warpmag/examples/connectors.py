@@ -36,14 +36,14 @@ class Example:
         self.viewer = viewer
 
     @staticmethod
-    def add_connector(builder, place, face):
+    def add_connector(builder, pose, face):
         """Add a housing with two opposite magnets in its face."""
-        body = builder.add_body(xform=place)
+        body = builder.add_body(xform=pose)
         plastic = newton.ModelBuilder.ShapeConfig(density=1200.0, mu=0.02, mu_torsional=0.0)
         builder.add_shape_box(body, hx=HALF[0], hy=HALF[1], hz=HALF[2], cfg=plastic)
         for side in (1.0, -1.0):
             pole = wp.transform((face * (HALF[0] - POLE), side * 0.007, 0.0), wp.quat_identity())
-            # plus the density of the plastic in the same place
+            # the density of the plastic in the same place is added
             heavy = newton.ModelBuilder.ShapeConfig(density=6300.0, mu=0.02, mu_torsional=0.0)
             shape = builder.add_shape_box(body, xform=pole, hx=POLE, hy=POLE, hz=POLE, cfg=heavy)
             warpmag.add_permanent(builder, shape=shape, material="N42", magnetization=(side, 0.0, 0.0))
@@ -52,9 +52,8 @@ class Example:
     def create_parser():
         """Return the parser of the example's options."""
         parser = warpmag.examples.create_parser(frames=60)
-        parser.add_argument(
-            "--twist", type=float, default=40.0, help="Twist of the second connector about its axis [°]."
-        )
+        text = "Twist of the second connector about its axis [°]."
+        parser.add_argument("--twist", type=float, default=40.0, help=text)
         return parser
 
     def step(self):
@@ -80,8 +79,8 @@ class Example:
         10 · 6e-8. At rest this error repeats, so momentum grows in proportion to the impulse that the connectors
         exchange. The tolerance is three such standard deviations.
         """
-        place, angle = self.mating()
-        np.testing.assert_allclose(place, (2 * HALF[0], 0.0, 0.0), atol=1e-4)
+        position, angle = self.mating()
+        np.testing.assert_allclose(position, (2 * HALF[0], 0.0, 0.0), atol=1e-4)
         assert angle < math.radians(1.0)
         masses, speeds = self.simulation.model.body_mass.numpy(), self.simulation.state.body_qd.numpy()
         state = self.simulation.state
@@ -92,9 +91,9 @@ class Example:
 
     def summary(self) -> str:
         """Return the result in one line."""
-        place, angle = self.mating()
-        off = 1e3 * np.linalg.norm(place - np.array((2 * HALF[0], 0.0, 0.0)))
-        return f"mated within {off:.2g} mm and {math.degrees(angle):.2g} degrees"
+        position, angle = self.mating()
+        error = 1e3 * np.linalg.norm(position - np.array((2 * HALF[0], 0.0, 0.0)))
+        return f"mated within {error:.2g} mm and {math.degrees(angle):.2g} degrees"
 
 
 if __name__ == "__main__":

@@ -30,13 +30,13 @@ class Example:
         slippery = newton.ModelBuilder.ShapeConfig(mu=0.1)
         builder.add_shape_box(-1, xform=plate, hx=0.5 * args.coils * PITCH + 0.02, hy=0.03, hz=0.0005, cfg=slippery)
         for coil in range(args.coils):
-            place = wp.transform((coil * PITCH, 0.0, COIL_HEIGHT), wp.quat_identity())
-            warpmag.add_coil(builder, shape="solenoid", radius=0.015, length=0.01, xform=place, label=f"coil{coil}")
+            pose = wp.transform((coil * PITCH, 0.0, COIL_HEIGHT), wp.quat_identity())
+            warpmag.add_coil(builder, shape="solenoid", radius=0.015, length=0.01, xform=pose, label=f"coil{coil}")
         self.steel, self.brass = [], []
         for number in range(args.balls):
             x, y = 1.2 * RADIUS * np.array((-1.0, 1.0))[[number % 2, number // 2 % 2]]
-            place = wp.transform((x - 4.8 * RADIUS * (number // 4), y, RADIUS), wp.quat_identity())
-            ball = builder.add_body(xform=place)
+            pose = wp.transform((x - 4.8 * RADIUS * (number // 4), y, RADIUS), wp.quat_identity())
+            ball = builder.add_body(xform=pose)
             steel = number % 2 == 1
             metal = newton.ModelBuilder.ShapeConfig(density=7870.0 if steel else 8500.0, mu=0.3, mu_rolling=0.02)
             builder.add_shape_sphere(ball, radius=RADIUS, cfg=metal)
@@ -47,7 +47,7 @@ class Example:
         self.simulation = warpmag.Simulation(builder, step=1e-3)
         self.coils = args.coils
         self.display = warpmag.Display(viewer, self.simulation.model, self.simulation.magnetics)
-        self.viewer, self.start = viewer, self.places()
+        self.viewer, self.start = viewer, self.positions()
 
     @staticmethod
     def create_parser():
@@ -69,22 +69,21 @@ class Example:
         """Show the balls."""
         self.display.show(self.simulation.time, self.simulation.state)
 
-    def places(self) -> np.ndarray:
+    def positions(self) -> np.ndarray:
         """Return the positions of the balls [m], shape [balls, 3]."""
         return self.simulation.state.body_q.numpy()[:, :3].astype(float)
 
     def test_final(self):
         """Check that all steel lies under the last coil, and all brass in its initial place."""
-        places = self.places()
-        last = (self.coils - 1) * PITCH
-        assert (np.abs(places[self.steel, 0] - last) < 0.5 * PITCH).all(), places[self.steel]
-        np.testing.assert_allclose(places[self.brass], self.start[self.brass], atol=1e-4)
-        np.testing.assert_allclose(places[:, 2], RADIUS, rtol=0.01)  # all balls lie on the ground
+        positions, last = self.positions(), (self.coils - 1) * PITCH
+        assert (np.abs(positions[self.steel, 0] - last) < 0.5 * PITCH).all(), positions[self.steel]
+        np.testing.assert_allclose(positions[self.brass], self.start[self.brass], atol=1e-4)
+        np.testing.assert_allclose(positions[:, 2], RADIUS, rtol=0.01)  # all balls lie on the ground
 
     def summary(self) -> str:
         """Return the result in one line."""
-        moved = 1e3 * np.linalg.norm(self.places() - self.start, axis=1)
-        return f"steel was carried {moved[self.steel].round(1)} mm, brass {moved[self.brass].round(1)} mm"
+        distances = 1e3 * np.linalg.norm(self.positions() - self.start, axis=1)
+        return f"steel was carried {distances[self.steel].round(1)} mm, brass {distances[self.brass].round(1)} mm"
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from warpmag.declarations.checks import check_count
 from warpmag.errors import InputError
 from warpmag.show.export import export
 from warpmag.usd import open_animated, stage_clock, usable_path
+from warpmag.usd.write.output import Output
 
 BLENDER = "WARPMAG_BLENDER"
 """Environment variable: a Python with ``bpy``, where this Python has none."""
@@ -65,11 +66,9 @@ def render_final(
         if not drawn.exists():
             errors = [line for line in done.stderr.splitlines() if line.strip()] or ["it wrote nothing"]
             raise InputError(f"{stage}: Blender could not draw it ({errors[-1].strip()})")
-        try:
+        with Output.errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(drawn.read_bytes())
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written ({error.strerror})") from None
     return path
 
 

@@ -13,15 +13,9 @@ _OUTSIDE, _MARGIN = 0.1, 1.65
 
 
 def draw(stage: str, output: str, frame: int, samples: int, width: int, height: int) -> str:
-    """Draw a denoised frame; return the reason why it cannot be drawn, or an empty string.
+    """Draw a denoised frame of a stage for renderers; return the reason why it cannot be drawn, or an empty string.
 
-    Args:
-        stage: USD file for renderers, as ``warpmag export`` writes it.
-        output: Picture to write.
-        frame: Time code.
-        samples: Paths per pixel.
-        width: Width of the picture [px].
-        height: Height of the picture [px].
+    ``frame`` is a time code, ``samples`` are paths per pixel, ``width`` and ``height`` those of the picture [px].
     """
     import bpy  # noqa: PLC0415  # pyright: ignore[reportMissingImports] - Blender as a module
 
@@ -61,10 +55,8 @@ def _paint_curves(bpy) -> None:
 
 
 def _frame_bodies(bpy, camera, aspect: float) -> None:
-    """Zoom and shift the lens to frame the bodies; the camera stays in its place.
-
-    The frame spans the middles of the bodies, without the outermost tenth on each side, plus half the median size.
-    """
+    """Zoom and shift the lens to frame the bodies, without moving the camera."""
+    # the frame spans the centers of the bodies, without the outermost tenth on each side, plus half the median size
     from mathutils import Vector  # noqa: PLC0415  # pyright: ignore[reportMissingImports] - of Blender
 
     to_camera = camera.matrix_world.inverted()
@@ -80,9 +72,9 @@ def _frame_bodies(bpy, camera, aspect: float) -> None:
     sides = []
     for spans in zip(*boxes, strict=True):
         ignored = int(_OUTSIDE * len(spans))
-        middles = sorted(0.5 * (low + high) for low, high in spans)
+        centers = sorted(0.5 * (low + high) for low, high in spans)
         size = sorted(high - low for low, high in spans)[len(spans) // 2]
-        sides.append((middles[ignored] - 0.5 * size, middles[-1 - ignored] + 0.5 * size))
+        sides.append((centers[ignored] - 0.5 * size, centers[-1 - ignored] + 0.5 * size))
     (left, right), (low, high) = sides
     lens = camera.data
     width = _MARGIN * max(right - left, aspect * (high - low), 1e-6)

@@ -11,6 +11,7 @@ from warpmag.errors import InputError
 from warpmag.show.magnet_overlays import COLORS, MagnetOverlays
 from warpmag.show.renderer_stage import RendererStage
 from warpmag.usd import Recording, open_animated, read_recording, usable_path
+from warpmag.usd.write.output import Output
 
 _TOP = 0.99
 """Quantile of all values at the end of the color scale, so that a few collisions do not compress the scale."""
@@ -87,7 +88,7 @@ def _write_numbers(stage: str | os.PathLike, path: Path) -> None:
         "velocities": record.linear * np.float32(record.meters_per_unit),
         "angular_velocities": record.angular,
     }
-    try:
+    with Output.errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.suffix == ".npz":
             names = {"bodies": np.array(record.bodies), "magnets": np.array(record.magnets)}
@@ -95,14 +96,12 @@ def _write_numbers(stage: str | os.PathLike, path: Path) -> None:
                 np.savez_compressed(file, time=record.seconds, moments=record.moments, **names, **columns)
         else:
             _write_table(path, record, columns)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
 
 
 def _write_table(path: Path, record: Recording, columns: dict[str, np.ndarray]) -> None:
     """Write a row for each body, and for each magnet that is not a body, at each time."""
     moments = {name: record.moments[:, k] for k, name in enumerate(record.magnets)}
-    others = [name for name in record.magnets if name not in record.bodies]
+    static = [name for name in record.magnets if name not in record.bodies]
     head = "time [s],prim,x [m],y [m],z [m],qx,qy,qz,qw,vx [m/s],vy [m/s],vz [m/s],wx [rad/s],wy [rad/s],wz [rad/s]"
     with open(path, "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
@@ -112,5 +111,5 @@ def _write_table(path: Path, record: Recording, columns: dict[str, np.ndarray]) 
             for row, name in enumerate(record.bodies):
                 moment = moments[name][frame].tolist() if name in moments else [""] * 3
                 table.writerow([second, name, *values[frame, row].tolist(), *moment])
-            for name in others:
+            for name in static:
                 table.writerow([second, name, *[""] * values.shape[-1], *moments[name][frame].tolist()])

@@ -1,6 +1,5 @@
 """Writes pictures as single files, or as a film."""
 
-import contextlib
 import itertools
 import math
 from collections.abc import Iterable, Iterator
@@ -40,7 +39,7 @@ def write(output: Path, pictures: Iterable[np.ndarray], frames: list[int], rate:
     Raises:
         InputError: A file cannot be written.
     """
-    with _named(output):
+    try:
         output.parent.mkdir(parents=True, exist_ok=True)
         kind = output.suffix.lower()
         if kind == ".mp4":
@@ -49,6 +48,8 @@ def write(output: Path, pictures: Iterable[np.ndarray], frames: list[int], rate:
             _write_gif(output, pictures, rate)
         else:
             return list(_write_each(output, pictures, frames))
+    except OSError as error:
+        raise InputError(f"{output}: cannot be written ({error.strerror or error})") from None
     return [output]
 
 
@@ -71,9 +72,8 @@ def _write_mp4(output: Path, pictures: Iterable[np.ndarray], rate: float) -> Non
     for picture in pictures:
         height, width = (2 * (size // 2) for size in picture.shape[:2])  # yuv420p needs even sizes
         if writer is None:
-            writer = _ffmpeg().write_frames(
-                str(output), (width, height), fps=rate, codec="libx264", quality=8, macro_block_size=2
-            )
+            settings = {"fps": rate, "codec": "libx264", "quality": 8, "macro_block_size": 2}
+            writer = _ffmpeg().write_frames(str(output), (width, height), **settings)
             writer.send(None)
         writer.send(np.ascontiguousarray(picture[:height, :width]))
     if writer is not None:
@@ -86,11 +86,3 @@ def _ffmpeg():
     except ImportError:
         raise InputError(f"a film as .mp4 needs {extra('video')}; .gif needs nothing") from None
     return imageio_ffmpeg
-
-
-@contextlib.contextmanager
-def _named(output: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise InputError(f"{output}: cannot be written ({error.strerror or error})") from None

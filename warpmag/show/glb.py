@@ -10,24 +10,11 @@ _FLOAT, _INDEX = 5126, 5125  # float32, uint32
 _VERTICES, _INDICES = 34962, 34963
 
 
-def glb(
-    points: np.ndarray,
-    normals: np.ndarray,
-    triangles: np.ndarray,
-    *,
-    color: Sequence[float],
-    metallic: float,
-    roughness: float,
-) -> bytes:
+def glb(points, normals, triangles, *, color: Sequence[float], metallic: float, roughness: float) -> bytes:
     """Return a mesh with a material as a binary glTF file.
 
-    Args:
-        points: Shape [n, 3].
-        normals: Unit normals at the points, shape [n, 3].
-        triangles: Corners, counterclockwise seen from outside, shape [k, 3].
-        color: Linear RGB.
-        metallic: Metalness, 0 to 1.
-        roughness: Roughness, 0 to 1.
+    Points and their unit normals have the shape [n, 3], triangles [k, 3], with corners counterclockwise seen from
+    outside. The color is linear RGB; metalness and roughness are 0 to 1.
     """
     points, normals = np.asarray(points, "<f4"), np.asarray(normals, "<f4")
     arrays = [points, normals, np.asarray(triangles, "<u4").reshape(-1)]

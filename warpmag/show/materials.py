@@ -1,21 +1,17 @@
 """Materials of surfaces: UsdPreviewSurface, which every renderer reads, and MaterialX."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdShade
 
 _MATERIALX = "ND_standard_surface_surfaceshader"
-_NAMES = {
-    "diffuseColor": "base_color",
-    "metallic": "metalness",
-    "roughness": "specular_roughness",
-    "clearcoat": "coat",
-}
+_NAMES = {"diffuseColor": "base_color", "metallic": "metalness", "roughness": "specular_roughness", "clearcoat": "coat"}
 """Inputs of UsdPreviewSurface that are authored here, and their names in MaterialX's standard surface."""
 
 _PLASMA = ((13, 8, 135), (92, 1, 166), (156, 23, 158), (204, 71, 120), (237, 121, 83), (253, 180, 47), (240, 249, 33))
-"""Colors of the scale, evenly spaced, 8-bit sRGB (Matplotlib's plasma, by N. Smith and S. van der Walt, CC0)."""
+"""Colors of the scale at equal distances, 8-bit sRGB (Matplotlib's plasma, by N. Smith and S. van der Walt, CC0)."""
 
 
 def author_surface(
@@ -26,15 +22,7 @@ def author_surface(
     roughness: float = 0.5,
     coat: float = 0.0,
 ) -> None:
-    """Author the surface of a material as UsdPreviewSurface.
-
-    Args:
-        material: The material.
-        color: Linear RGB.
-        metallic: Metalness, 0 to 1.
-        roughness: Roughness, 0 to 1.
-        coat: Clear lacquer, 0 to 1.
-    """
+    """Author the surface of a material as UsdPreviewSurface; the color is linear RGB, other values are 0 to 1."""
     values = {"diffuseColor": Gf.Vec3f(*color), "metallic": metallic, "roughness": roughness, "clearcoat": coat}
     _connect(material, "Surface", "UsdPreviewSurface", values, material.CreateSurfaceOutput(), "surface")
 
@@ -49,8 +37,8 @@ def author_materialx(stage: Usd.Stage) -> None:
             material = UsdShade.Material(prim)
             shader, _, _ = material.ComputeSurfaceSource()
             if shader and shader.GetShaderId() == "UsdPreviewSurface":
-                inputs = {own: shader.GetInput(name) for name, own in _NAMES.items()}
-                values = {own: port.Get() for own, port in inputs.items() if port and port.Get() is not None}
+                values = {name: surface_value(material, key) for key, name in _NAMES.items()}
+                values = {name: value for name, value in values.items() if value is not None}
                 _connect(material, "MaterialX", _MATERIALX, values, material.CreateSurfaceOutput("mtlx"), "out")
 
 
@@ -61,20 +49,29 @@ def color_scale(count: int) -> np.ndarray:
     return np.stack([np.interp(at, np.arange(len(anchors)), anchors[:, k]) for k in range(3)], axis=1)
 
 
-def _connect(material, name, identifier, values, output, own_output) -> None:
-    """Author a shader below a material and connect its output ``own_output`` to the material's ``output``."""
+def _connect(material, name, identifier, values, output, source) -> None:
+    """Author a shader below a material and connect its output ``source`` to the material's ``output``."""
     shader = UsdShade.Shader.Define(material.GetPrim().GetStage(), material.GetPath().AppendChild(name))
     shader.CreateIdAttr(identifier)
     for key, value in values.items():
         kind = Sdf.ValueTypeNames.Float if isinstance(value, float) else Sdf.ValueTypeNames.Color3f
         shader.CreateInput(key, kind).Set(value)
-    output.ConnectToSource(shader.ConnectableAPI(), own_output)
+    output.ConnectToSource(shader.ConnectableAPI(), source)
 
 
-def metalness(stage: Usd.Stage, prim: str) -> float:
-    """Return the metalness of a prim's surface, 0 to 1, from the UsdPreviewSurface that is bound to it."""
-    drawn = stage.GetPrimAtPath(prim)
-    material, _ = UsdShade.MaterialBindingAPI(drawn).ComputeBoundMaterial() if drawn else (None, None)
+def bound_material(prim: Usd.Prim) -> UsdShade.Material | None:
+    """Return the material that is bound to a prim."""
+    material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0] if prim else None
+    return material or None
+
+
+def surface_value(material: UsdShade.Material | None, name: str) -> Any:
+    """Return the value of an input of a material's UsdPreviewSurface; None if there is none."""
     surface = material.ComputeSurfaceSource()[0] if material else None
-    value = surface.GetInput("metallic").Get() if surface and surface.GetInput("metallic") else None
+    return surface.GetInput(name).Get() if surface and surface.GetInput(name) else None
+
+
+def metalness(stage: Usd.Stage, path: str) -> float:
+    """Return the metalness of a prim's surface, 0 to 1."""
+    value = surface_value(bound_material(stage.GetPrimAtPath(path)), "metallic")
     return min(max(float(value), 0.0), 1.0) if isinstance(value, float) else 0.0

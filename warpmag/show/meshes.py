@@ -1,7 +1,8 @@
 """Meshes of the solids of UsdGeom: importers, such as Blender's, drop the materials of spheres and cubes."""
 
 import functools
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from pxr import Gf, Usd, UsdGeom, Vt
@@ -45,8 +46,8 @@ def author_mesh(mesh: UsdGeom.Mesh, points: np.ndarray, faces: Sequence[np.ndarr
     at_points = np.zeros((len(points), 3))
     at_points[corners] = normals
     smooth = np.allclose(at_points[corners], normals, rtol=0.0, atol=1e-6)
-    chosen = at_points if smooth else normals
-    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(chosen, dtype=np.float32)))
+    normals = at_points if smooth else normals
+    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, dtype=np.float32)))
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex if smooth else UsdGeom.Tokens.faceVarying)
     low, high = points.min(axis=0), points.max(axis=0)
     mesh.CreateExtentAttr([Gf.Vec3f(*low.tolist()), Gf.Vec3f(*high.tolist())])
@@ -65,59 +66,62 @@ def corner_normals(points: np.ndarray, faces: Sequence[np.ndarray]) -> np.ndarra
     sizes = np.array([len(face) for face in faces])
     corners, owners = np.concatenate(faces), np.repeat(np.arange(len(faces)), sizes)
     start = np.repeat(np.cumsum(sizes) - sizes, sizes)
-    place = np.arange(len(corners)) - start
-    following = corners[start + (place + 1) % np.repeat(sizes, sizes)]
-    middle = points[corners[start]]
+    number = np.arange(len(corners)) - start  # of the corner in its face
+    following = corners[start + (number + 1) % np.repeat(sizes, sizes)]
+    origin = points[corners[start]]
     areas = np.zeros((len(faces), 3))
-    np.add.at(areas, owners, np.cross(points[corners] - middle, points[following] - middle))
+    np.add.at(areas, owners, np.cross(points[corners] - origin, points[following] - origin))
     flat = areas / np.linalg.norm(areas, axis=1, keepdims=True)
-    # all pairs of corners that share a point; corners are sorted by point
+    # all pairs of corners that share a point: rows of ``corner`` and faces of the second corner
     order = np.argsort(corners, kind="stable")
     shared = np.bincount(corners, minlength=len(points))
     first = (np.cumsum(shared) - shared)[corners]
     count = shared[corners]
-    mine = np.repeat(np.arange(len(corners)), count)
-    turn = np.arange(len(mine)) - np.repeat(np.cumsum(count) - count, count)
-    other = owners[order[first[mine] + turn]]
-    smooth = np.einsum("ni,ni->n", flat[owners[mine]], flat[other]) > _CREASE
+    corner = np.repeat(np.arange(len(corners)), count)
+    rank = np.arange(len(corner)) - np.repeat(np.cumsum(count) - count, count)
+    face = owners[order[first[corner] + rank]]
+    smooth = np.einsum("ni,ni->n", flat[owners[corner]], flat[face]) > _CREASE
     sums = np.zeros((len(corners), 3))
-    np.add.at(sums, mine[smooth], areas[other[smooth]])
+    np.add.at(sums, corner[smooth], areas[face[smooth]])
     return sums / np.linalg.norm(sums, axis=1, keepdims=True)
 
 
-def turned(profile: np.ndarray, around: int = _AROUND) -> Shape:
-    """Return the surface of revolution of a line about z.
+def triangles_of(faces: Iterable[Sequence[int] | np.ndarray]) -> np.ndarray:
+    """Return the triangles of polygons, as fans from their first corners, shape [k, 3]."""
+    return np.array([(face[0], a, b) for face in faces for a, b in itertools.pairwise(face[1:])])
 
-    Args:
-        profile: Points (r, z) of the line from the lower pole to the upper one, r = 0 at the poles only, shape [k, 2].
-        around: Number of corners around z.
+
+def revolved(profile: np.ndarray, around: int = _AROUND) -> Shape:
+    """Return the surface of revolution of a line about z, with ``around`` corners around z.
+
+    ``profile`` are points (r, z) from the lower pole to the upper one, r = 0 at the poles only, shape [k, 2].
     """
     angle = 2.0 * np.pi * np.arange(around) / around
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     rings = [np.c_[r * circle, np.full(around, z)] for r, z in profile[1:-1].tolist()]
     poles = np.array([[0.0, 0.0, profile[0, 1]], [0.0, 0.0, profile[-1, 1]]])
     points = np.concatenate([*rings, poles])
-    here = np.arange(around)
-    after = np.roll(here, -1)
+    corner = np.arange(around)
+    following = np.roll(corner, -1)
     last, low, high = (len(rings) - 1) * around, len(points) - 2, len(points) - 1
-    faces = list(np.stack([np.full(around, low), after, here], axis=1))
+    faces = list(np.stack([np.full(around, low), following, corner], axis=1))
     for ring in range(len(rings) - 1):
         a, b = ring * around, (ring + 1) * around
-        faces += list(np.stack([here + a, after + a, after + b, here + b], axis=1))
-    return points, faces + list(np.stack([here + last, after + last, np.full(around, high)], axis=1))
+        faces += list(np.stack([corner + a, following + a, following + b, corner + b], axis=1))
+    return points, faces + list(np.stack([corner + last, following + last, np.full(around, high)], axis=1))
 
 
-def _arc(radius: float, middle: float, begin: float, end: float, count: int) -> np.ndarray:
-    """Return points (r, z) of an arc about (0, middle); angles from the equator in units of π."""
+def _arc(radius: float, center: float, begin: float, end: float, count: int) -> np.ndarray:
+    """Return points (r, z) of an arc about (0, center); angles from the equator in units of π."""
     angle = np.pi * np.linspace(begin, end, count)
-    return np.stack([radius * np.cos(angle), middle + radius * np.sin(angle)], axis=1)
+    return np.stack([radius * np.cos(angle), center + radius * np.sin(angle)], axis=1)
 
 
 @functools.cache  # thousands of balls have the same radius
 def _sphere(radius: float) -> Shape:
     profile = _arc(radius, 0.0, -0.5, 0.5, _AROUND // 2 + 1)
     profile[[0, -1], 0] = 0.0
-    return turned(profile)
+    return revolved(profile)
 
 
 def _box(side: float) -> Shape:
@@ -133,7 +137,7 @@ def _plane(width: float, length: float) -> Shape:
 
 def _cylinder(low: float, high: float, height: float) -> Shape:
     h = 0.5 * height
-    return turned(np.array([(0.0, -h), (low, -h), (high, h), (0.0, h)]))
+    return revolved(np.array([(0.0, -h), (low, -h), (high, h), (0.0, h)]))
 
 
 def _capsule(low: float, high: float, height: float) -> Shape:
@@ -141,12 +145,12 @@ def _capsule(low: float, high: float, height: float) -> Shape:
     lower, upper = _arc(low, -h, -0.5, 0.0, 5), _arc(high, h, 0.0, 0.5, 5)
     profile = np.concatenate([lower, upper])
     profile[[0, -1], 0] = 0.0
-    return turned(profile, _AROUND // 3)
+    return revolved(profile, _AROUND // 3)
 
 
 def _cone(radius: float, height: float) -> Shape:
     h = 0.5 * height
-    return turned(np.array([(0.0, -h), (radius, -h), (0.0, h)]))
+    return revolved(np.array([(0.0, -h), (radius, -h), (0.0, h)]))
 
 
 _MAKERS: dict[type, tuple] = {
@@ -163,5 +167,5 @@ _MAKERS: dict[type, tuple] = {
 
 BALL = _sphere(1.0)
 """A ball of radius 1."""
-ARROW = turned(np.array([(0.0, -0.5), (0.05, -0.5), (0.05, 0.15), (0.14, 0.15), (0.0, 0.5)]), 16)
+ARROW = revolved(np.array([(0.0, -0.5), (0.05, -0.5), (0.05, 0.15), (0.14, 0.15), (0.0, 0.5)]), 16)
 """An arrow along z from -1/2 to 1/2."""

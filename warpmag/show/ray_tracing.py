@@ -102,14 +102,7 @@ def _numbers(stage, clock: StageClock, output: Path, frame: int | None, frames: 
 
 
 class _Renderer:
-    """A stage and a camera.
-
-    Args:
-        scene: The stage, imported with its visual shapes.
-        path: File of the stage.
-        size: Width and height of the pictures [px].
-        moments: Show moments as arrows.
-    """
+    """A stage, imported from ``path`` with its visual shapes, and a camera for pictures of ``size`` [px]."""
 
     def __init__(self, scene: ImportedScene, path, size: tuple[int, int], moments: bool):
         self._scene, self._motion, (self._width, self._height) = scene, Playback(scene.stage, scene.swarms), size
@@ -143,54 +136,40 @@ class _Renderer:
         if self._arrows:
             self._arrows.place(model, poses, self._motion)
         model.bvh_refit_shapes(state)
-        all_rays, place = self._view
-        turn = np.array(wp.quat_to_matrix(wp.transform_get_rotation(place))).reshape(3, 3)
-        places = wp.array([place], dtype=wp.transformf, device=model.device)
+        all_rays, pose = self._view
+        rotation = np.array(wp.quat_to_matrix(wp.transform_get_rotation(pose))).reshape(3, 3)
+        camera_poses = wp.array([pose], dtype=wp.transformf, device=model.device)
         light, up = np.zeros((self._height, self._width, 3)), np.eye(3)[int(model.up_axis)]
         for k in range(_SAMPLES**2):
             rays = np.ascontiguousarray(all_rays[k // _SAMPLES :: _SAMPLES, k % _SAMPLES :: _SAMPLES])
-            scattered, normals, shapes = self._traced(rays, places)
-            directions = rays[..., 0, 1, :] @ turn.T
+            scattered, normals, shapes = self._trace(rays, camera_poses)
+            directions = rays[..., 0, 1, :] @ rotation.T
             light += _shade(scattered, normals, directions, shapes, self._albedo, self._metal, up)
         return _to_srgb(light / _SAMPLES**2)
 
-    def _traced(self, rays: np.ndarray, places: wp.array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _trace(self, rays: np.ndarray, poses: wp.array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return scattered light, normals and shapes (-1 where a ray hits none), shape [height, width, ...]."""
         camera, shape = self._camera, (1, self._width, self._height)
         light: Any = camera.allocate_image_color_hdr(*shape)
         normals: Any = camera.allocate_image_normal(*shape)
         shapes: Any = camera.allocate_image_shape_index(*shape)
-        camera.update(
-            self._state,
-            places,
-            wp.array(rays, dtype=wp.vec3f, device=self._model.device),
-            hdr_color_image=light,
-            normal_image=normals,
-            shape_index_image=shapes,
-            render_config=self._config,
-        )
+        images = {"hdr_color_image": light, "normal_image": normals, "shape_index_image": shapes}
+        directions = wp.array(rays, dtype=wp.vec3f, device=self._model.device)
+        camera.update(self._state, poses, directions, **images, render_config=self._config)
         hits = shapes.numpy()[0].astype(np.int64)
         return light.numpy()[0], normals.numpy()[0], np.where(hits < self._model.shape_count, hits, -1)
 
 
 class _Arrows:
-    """Cones on magnets along their moments.
-
-    Args:
-        scene: The stage; its builder gets the cones.
-        path: File of the stage.
-
-    Raises:
-        InputError: The stage has no moments.
-    """
+    """Cones on magnets along their moments, added to the builder of a scene; an error if it has no moments."""
 
     def __init__(self, scene: ImportedScene, path):
         self._prims = list(scene.magnet_shapes)
         if not Playback(scene.stage, scene.swarms).moments(self._prims).any():
             raise InputError(f"{path}: holds no moments to show; a run writes them")
         builder = scene.builder
-        self._holders = [scene.magnet_shapes[prim][0] for prim in self._prims]
-        self._sizes = np.array([builder.shape_collision_radius[shape] for shape in self._holders])
+        self._shapes = [scene.magnet_shapes[prim][0] for prim in self._prims]
+        self._sizes = np.array([builder.shape_collision_radius[shape] for shape in self._shapes])
         config = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False, has_particle_collision=False)
         self._cones = [
             builder.add_shape_cone(-1, radius=0.3 * size, half_height=0.4 * size, cfg=config, color=_ARROW_COLOR)
@@ -202,18 +181,16 @@ class _Arrows:
         moments, frames = motion.moments(self._prims), model.shape_transform.numpy()
         lengths = np.linalg.norm(moments, axis=1)
         strengths = lengths / self._sizes**3
-        body = model.shape_body.numpy()[self._holders]
-        for row, (cone, holder) in enumerate(zip(self._cones, self._holders, strict=True)):
-            frame = wp.transform(*frames[holder])
-            center = (wp.transform(*poses[body[row]]) * frame if body[row] >= 0 else frame).p
+        bodies = model.shape_body.numpy()[self._shapes]
+        for row, (cone, shape, body) in enumerate(zip(self._cones, self._shapes, bodies, strict=True)):
+            frame = wp.transform(*frames[shape])
+            center = (wp.transform(*poses[body]) * frame if body >= 0 else frame).p
             if strengths[row] <= _LEAST_SHOWN * strengths.max():
                 frames[cone, :3] = center
                 continue
             axis = wp.vec3(*(moments[row] / lengths[row]).tolist())
-            frames[cone] = [
-                *(center + 1.4 * float(self._sizes[row]) * axis),
-                *wp.quat_between_vectors(wp.vec3(0.0, 0.0, 1.0), axis),
-            ]
+            tip = center + 1.4 * float(self._sizes[row]) * axis
+            frames[cone] = [*tip, *wp.quat_between_vectors(wp.vec3(0.0, 0.0, 1.0), axis)]
         model.shape_transform.assign(frames)
 
 
@@ -233,19 +210,18 @@ def _looking_at_bodies(model: newton.Model, field: float) -> wp.transform:
     shape_body, poses = model.shape_body.numpy(), model.body_q.numpy()
     frames, radii = model.shape_transform.numpy(), model.shape_collision_radius.numpy()
     shown = np.flatnonzero(shape_body >= 0) if (shape_body >= 0).any() else np.arange(model.shape_count)
-    places = np.zeros((len(shown), 3))
+    centers = np.zeros((len(shown), 3))
     for row, shape in enumerate(shown):
-        place = wp.vec3(*frames[shape, :3])
-        body = shape_body[shape]
-        places[row] = wp.transform_point(wp.transform(*poses[body]), place) if body >= 0 else place
-    low, high = (sign * (sign * places + radii[shown, None]).max(axis=0) for sign in (-1.0, 1.0))
+        origin, body = wp.vec3(*frames[shape, :3]), shape_body[shape]
+        centers[row] = wp.transform_point(wp.transform(*poses[body]), origin) if body >= 0 else origin
+    low, high = (sign * (sign * centers + radii[shown, None]).max(axis=0) for sign in (-1.0, 1.0))
     center, extent = 0.5 * (low + high), 0.5 * np.linalg.norm(high - low)
     back = np.array(_VIEW) / np.linalg.norm(_VIEW)
     right = np.cross((0.0, 0.0, 1.0), back)
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(back, right), back], axis=1)  # the camera looks along its -z, y is up
-    place = center + extent / math.sin(0.5 * field) * back
-    return wp.transform(wp.vec3(*place), wp.quat_from_matrix(wp.mat33(*axes.ravel().tolist())))
+    eye = center + extent / math.sin(0.5 * field) * back
+    return wp.transform(wp.vec3(*eye), wp.quat_from_matrix(wp.mat33(*axes.ravel().tolist())))
 
 
 # ---------- Light and color ----------
@@ -254,14 +230,8 @@ def _looking_at_bodies(model: newton.Model, field: float) -> wp.transform:
 def _shade(scattered: np.ndarray, normals: np.ndarray, rays: np.ndarray, shapes, albedo, metal, up) -> np.ndarray:
     """Return the linear radiance of each ray, shape [..., 3].
 
-    Args:
-        scattered: Radiance of the surfaces as if they were matt, shape [..., 3].
-        normals: Normals at the hit points, shape [..., 3].
-        rays: Unit directions, shape [..., 3].
-        shapes: Shape that each ray hits, -1 where it hits none, shape [...].
-        albedo: Linear color of each shape, shape [s, 3].
-        metal: Metalness of each shape, shape [s].
-        up: Direction from the ground to the sky, shape [3].
+    ``scattered`` is the radiance of the surfaces as if they were matt; ``rays`` are unit directions, shape [..., 3].
+    ``shapes`` are those that rays hit, -1 for none, ``albedo`` and ``metal`` the linear color and metalness by shape.
     """
     radiance = np.where((shapes < 0)[..., None], _surroundings(np.maximum(rays @ up, 0.0)), scattered)
     polished = np.flatnonzero((shapes.ravel() >= 0) & (metal[shapes.ravel()] > 0.0))
@@ -275,8 +245,8 @@ def _shade(scattered: np.ndarray, normals: np.ndarray, rays: np.ndarray, shapes,
         lit = scattered.reshape(-1, 3)[polished] / np.maximum(albedo[shape], 1e-3)  # shadows darken reflections, too
         seen = seen * np.clip(lit / np.array(_AMBIENT[0]), 0.35, 1.0) + _HIGHLIGHT * towards**_SHARPNESS
         reflectance = albedo[shape] + (1.0 - albedo[shape]) * (1.0 - facing) ** 5
-        part = metal[shape][:, None]
-        flat[polished] = (1.0 - part) * flat[polished] + part * reflectance * seen
+        weight = metal[shape][:, None]
+        flat[polished] = (1.0 - weight) * flat[polished] + weight * reflectance * seen
     return radiance
 
 

@@ -15,8 +15,8 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 
 from warpmag.errors import InputError
-from warpmag.show.instances import InstanceArrays, author_curves, author_instances, turns_to
-from warpmag.show.materials import author_materialx, author_surface, color_scale
+from warpmag.show.instances import InstanceArrays, author_curves, author_instances, rotations_from_z
+from warpmag.show.materials import author_materialx, author_surface, bound_material, color_scale
 from warpmag.show.meshes import ARROW, BALL, Shape, author_mesh, shape_of
 from warpmag.show.web_page import page_of
 from warpmag.usd.paths import usable_path
@@ -26,7 +26,7 @@ from warpmag.usd.read.opening import copied_metadata, open_animated
 from warpmag.usd.read.prims import is_body
 from warpmag.usd.read.recording import read_recording
 from warpmag.usd.read.transforms import rigid_part
-from warpmag.usd.values import quiet
+from warpmag.usd.write.output import Output
 
 _SUFFIXES = (".usd", ".usda", ".usdc", ".usdz", ".html")
 _SIMULATION_PREFIXES = ("physics:", "newton:", "warpmag:", "collection:")
@@ -35,38 +35,27 @@ _SCHEMAS = ("Physics", "Newton", "Warpmag", "CollectionAPI")
 _SIZES = ("radius", "radiusTop", "radiusBottom", "size", "height", "width", "length", "axis", "extent", "doubleSided")
 _PURPOSES = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
 _DIGITS = 6
-"""Digits to which shapes, and their places in their bodies, must agree to share a mesh."""
+"""Digits to which the points of shapes must agree to share a mesh."""
 _SHADES = 24
 """Number of colors of a scale."""
 
 
 @dataclass
 class DrawnShape:
-    """A shape of a body, or a static one.
+    """A shape of a body, or a static one."""
 
-    Attributes:
-        path: Path of the shape's prim.
-        row: Row of the body in the recording, -1 for a static shape.
-        frame: Transform of the prim in the frame of the body, or in the world, shape [4, 4], for rows of points.
-        drawn: True if the shape is visible.
-        radius: Radius of a ball, 0 for other shapes.
-        points: Points in that frame, shape [k, 3]; empty for a ball.
-        faces: Corners of each face.
-        looks: Path of the bound material, or "", and display color, or ().
-    """
-
-    path: str
-    row: int
-    frame: np.ndarray
-    drawn: bool
-    radius: float
-    points: np.ndarray
-    faces: list[np.ndarray]
-    looks: tuple = ()
+    path: str  # of the shape's prim
+    row: int  # of the body in the recording, -1 for a static shape
+    frame: np.ndarray  # of the prim in the frame of the body, or in the world, shape [4, 4], for rows of points
+    drawn: bool  # true if the shape is visible
+    radius: float  # of a ball, 0 for other shapes
+    points: np.ndarray  # in the frame of the body, or in the world, shape [k, 3]; empty for a ball
+    faces: list[np.ndarray]  # corners of each face
+    appearance: tuple = ()  # path of the bound material, or "", and display color, or ()
 
     @property
-    def middle(self) -> np.ndarray:
-        """Middle of the bounding box, shape [3]."""
+    def center(self) -> np.ndarray:
+        """Center of the bounding box, shape [3]."""
         return self.frame[3, :3] if self.radius else 0.5 * (self.points.min(axis=0) + self.points.max(axis=0))
 
     @property
@@ -101,20 +90,20 @@ class RendererStage:
         stage.SetStartTimeCode(float(np.floor(self._codes[0] + 1e-6)))
         # the last frame is at the step nearest to it, which may be slightly later
         stage.SetEndTimeCode(float(np.ceil(self._codes[-1] - 0.05)))
-        self._before = Sdf.Layer.CreateAnonymous(".usda")
-        self._before.TransferContent(stage.GetRootLayer())
+        self._scene = Sdf.Layer.CreateAnonymous(".usda")
+        self._scene.TransferContent(stage.GetRootLayer())
         self.shapes = self._find_shapes()
         for swarm in swarms:
             self.shapes = swarm.with_copies(self.shapes, self.recording.bodies)
         instanced = self._instanced()
-        self._instances = [shape for shape in self.shapes if shape.drawn and shape.row >= 0 and instanced[shape.row]]
+        self._moving = [shape for shape in self.shapes if shape.drawn and shape.row >= 0 and instanced[shape.row]]
         self._root = self._make_root()
 
     def _make_root(self) -> Sdf.Path:
         """Remove prims that are drawn as instances, or not at all; return the path of a prim for new ones."""
         stage, layer = self._stage, self._stage.GetRootLayer()
-        moved = {shape.path for shape in self._instances}
-        static = [shape for shape in self.shapes if shape.drawn and shape.path not in moved]
+        moving = {shape.path for shape in self._moving}
+        static = [shape for shape in self.shapes if shape.drawn and shape.path not in moving]
         kept = {shape.path for shape in static}
         with Sdf.ChangeBlock():
             _strip(layer, [Sdf.Path(shape.path) for shape in self.shapes if shape.path not in kept], kept)
@@ -136,7 +125,7 @@ class RendererStage:
         stage, shapes = self._stage, []
         rows = {path: row for row, path in enumerate(self.recording.bodies)}
         transforms = UsdGeom.XformCache(stage.GetStartTimeCode())
-        frames: dict[str, np.ndarray] = {}
+        to_body: dict[str, np.ndarray] = {}
         for prim in stage.Traverse():
             surface = shape_of(prim)
             if surface is None:
@@ -144,12 +133,11 @@ class RendererStage:
             body = _body_of(prim)
             frame = np.array(transforms.GetLocalToWorldTransform(prim))
             if body:
-                name = str(body.GetPath())
-                if name not in frames:
-                    own = rigid_part(np.array(transforms.GetLocalToWorldTransform(body)))
-                    frames[name] = np.linalg.inv(own)
-                frame = frame @ frames[name]
-            shapes.append(_drawn_shape(prim, surface, rows[name] if body else -1, frame))
+                path = str(body.GetPath())
+                if path not in to_body:
+                    to_body[path] = np.linalg.inv(rigid_part(np.array(transforms.GetLocalToWorldTransform(body))))
+                frame = frame @ to_body[path]
+            shapes.append(_drawn_shape(prim, surface, rows[path] if body else -1, frame))
         return shapes
 
     def _instanced(self) -> np.ndarray:
@@ -193,71 +181,67 @@ class RendererStage:
         """Add the bodies.
 
         Args:
-            shades: Place of each body's color on the scale, 0 to 1, shape [f, n]; None keeps their own materials.
+            shades: Position of each body's color on the scale, 0 to 1, shape [f, n]; None keeps their own materials.
         """
-        materials = self._scale() if shades is not None else []
+        materials = self._author_scale() if shades is not None else None
         record = self.recording
         for name in ("Balls", "Bodies"):
             balls = name == "Balls"
-            shapes = [shape for shape in self._instances if bool(shape.radius) == balls]
+            shapes = [shape for shape in self._moving if bool(shape.radius) == balls]
             if not shapes:
                 continue
-            rows = np.array([shape.row for shape in shapes])
-            path = self._root.AppendChild(name)
-            prototypes: dict[tuple, int] = {}
-            kinds = self._kinds(path, shapes, shades, materials, prototypes)
-            placed = InstanceArrays(
-                record.positions[:, rows],
-                kinds,
-                turns=None if balls else record.rotations[:, rows],
-                scales=np.array([shape.radius for shape in shapes]) if balls else None,
-                linear=record.linear[:, rows],
-                angular=None if balls else record.angular[:, rows],
-            )
-            paths = [_prototype_path(path, number) for number in range(len(prototypes))]
-            author_instances(self._stage, path, paths, self._codes, placed)
+            rows, path = np.array([shape.row for shape in shapes]), self._root.AppendChild(name)
+            paths, indices = self._author_prototypes(path, shapes, shades, materials)
+            motion = {"positions": record.positions[:, rows], "velocities": record.linear[:, rows]}
+            if balls:
+                motion["scales"] = np.array([shape.radius for shape in shapes])
+            else:
+                motion |= {"orientations": record.rotations[:, rows], "angular_velocities": record.angular[:, rows]}
+            instances = InstanceArrays(prototypes=indices, **motion)
+            author_instances(self._stage, path, paths, self._codes, instances)
 
-    def _kinds(self, path, shapes, shades, materials, prototypes) -> np.ndarray:
-        """Return the prototype of each shape, shape [k] or per sample [f, k]; author missing prototypes."""
+    def _author_prototypes(self, path, shapes, shades, materials) -> tuple[list[Sdf.Path], np.ndarray]:
+        """Author the prototypes of shapes; return their paths, and the index of each shape's, shape [k] or [f, k]."""
         if shades is None:
-            steps = np.zeros((1, len(shapes)), dtype=int)
+            colors = np.zeros((1, len(shapes)), dtype=int)
         else:
-            steps = np.rint(shades[:, [shape.row for shape in shapes]] * (_SHADES - 1)).astype(int)
-        kinds = np.empty(steps.shape, dtype=int)
+            colors = np.rint(shades[:, [shape.row for shape in shapes]] * (_SHADES - 1)).astype(int)
+        indices, prototypes = np.empty(colors.shape, dtype=int), {}
         for column, shape in enumerate(shapes):
-            key = _key(shape, with_looks=shades is None)
-            for step in np.unique(steps[:, column]).tolist():
-                full = (key, step)
-                if full not in prototypes:
-                    prototypes[full] = len(prototypes)
-                    self._author_prototype(_prototype_path(path, prototypes[full]), shape, materials[step:][:1])
-                kinds[steps[:, column] == step, column] = prototypes[full]
-        return kinds[0] if shades is None else kinds
+            shape_key = _key(shape, with_appearance=shades is None)
+            for color in np.unique(colors[:, column]).tolist():
+                key = (shape_key, color)
+                if key not in prototypes:
+                    prototype = path.AppendPath(f"Prototypes/Shape_{len(prototypes):03d}")
+                    prototypes[key] = prototype, len(prototypes)
+                    self._author_prototype(prototype, shape, materials[color] if materials else None)
+                indices[colors[:, column] == color, column] = prototypes[key][1]
+        return [prototype for prototype, _ in prototypes.values()], indices[0] if shades is None else indices
 
-    def _author_prototype(self, path: Sdf.Path, shape: DrawnShape, material: Sequence[UsdShade.Material]) -> None:
-        """Author the mesh of a prototype in the frame of its body."""
-        stage = self._stage
+    def _author_prototype(self, path: Sdf.Path, shape: DrawnShape, material: UsdShade.Material | None) -> None:
+        """Author the mesh of a prototype in the frame of its body, with its own or another material."""
+        stage, (own_material, color) = self._stage, shape.appearance
         UsdGeom.Scope.Define(stage, path.GetParentPath())
-        source = self._before.GetPrimAtPath(shape.path)
+        source = self._scene.GetPrimAtPath(shape.path)
         if source and source.typeName == "Mesh":  # a ball of an instancer has no prim
-            Sdf.CopySpec(self._before, shape.path, stage.GetRootLayer(), path)
+            Sdf.CopySpec(self._scene, shape.path, stage.GetRootLayer(), path)
             with Sdf.ChangeBlock():
                 _strip(stage.GetRootLayer(), [], below=path)
             mesh = UsdGeom.Mesh(stage.GetPrimAtPath(path))
-            _bake(mesh, shape)
+            _transform_to_body(mesh, shape)
         else:
             mesh = UsdGeom.Mesh.Define(stage, path)
             author_mesh(mesh, *(BALL if shape.radius else (shape.points, shape.faces)))
-            if shape.looks[1]:
-                mesh.CreateDisplayColorAttr(Vt.Vec3fArray([Gf.Vec3f(*shape.looks[1])]))
+            if color:
+                mesh.CreateDisplayColorAttr(Vt.Vec3fArray([Gf.Vec3f(*color)]))
         binding = UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim())
         if material:
-            binding.Bind(material[0])
+            binding.Bind(material)
             mesh.GetDisplayColorAttr().Clear()
-        elif shape.looks[0]:
-            binding.Bind(UsdShade.Material(stage.GetPrimAtPath(shape.looks[0])))
+        elif own_material:
+            binding.Bind(UsdShade.Material(stage.GetPrimAtPath(own_material)))
 
-    def _scale(self) -> list[UsdShade.Material]:
+    def _author_scale(self) -> list[UsdShade.Material]:
         """Author and return the materials of the color scale."""
         materials = []
         for number, color in enumerate(color_scale(_SHADES)):
@@ -266,27 +250,16 @@ class RendererStage:
             author_surface(materials[-1], color=color, roughness=0.35, coat=0.5)
         return materials
 
-    def add_arrows(self, middles: np.ndarray, moments: np.ndarray, lengths: np.ndarray) -> None:
-        """Add an arrow for each magnet.
-
-        Args:
-            middles: Middles of the magnets, shape [f, m, 3].
-            moments: Moments of the magnets, shape [f, m, 3].
-            lengths: Lengths of the arrows, shape [f, m].
-        """
+    def add_arrows(self, centers: np.ndarray, moments: np.ndarray, lengths: np.ndarray) -> None:
+        """Add arrows of given lengths, shape [f, m], at the centers of magnets along their moments, shape [f, m, 3]."""
         path = self._root.AppendChild("Moments")
         mesh = UsdGeom.Mesh.Define(self._stage, path.AppendPath("Prototypes/Arrow"))
         UsdGeom.Scope.Define(self._stage, path.AppendChild("Prototypes"))
         author_mesh(mesh, *ARROW)
         self._paint(mesh.GetPrim(), "Arrow", (0.9, 0.35, 0.02))
-        kinds = np.zeros(moments.shape[1], dtype=int)
-        author_instances(
-            self._stage,
-            path,
-            [mesh.GetPath()],
-            self._codes,
-            InstanceArrays(middles, kinds, turns=turns_to(moments), scales=lengths),
-        )
+        prototypes = np.zeros(moments.shape[1], dtype=int)
+        arrows = InstanceArrays(centers, prototypes, orientations=rotations_from_z(moments), scales=lengths)
+        author_instances(self._stage, path, [mesh.GetPath()], self._codes, arrows)
 
     def add_lines(self, points: np.ndarray, width: float) -> None:
         """Add field lines, shape [f, lines, points, 3], as curves of the given width."""
@@ -312,32 +285,28 @@ class RendererStage:
             raise InputError(f"{path}: would overwrite the exported scene")
         if materialx:
             author_materialx(self._stage)
-        try:
+        with Output.errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(prefix=f".{path.stem}.", dir=path.parent) as folder, quiet():
-                inner = Path(folder) / (f"{path.stem}.usdc" if path.suffix == ".usdz" else path.name)
+            with tempfile.TemporaryDirectory(prefix=f".{path.stem}.", dir=path.parent) as folder:
+                file = Path(folder) / (f"{path.stem}.usdc" if path.suffix == ".usdz" else path.name)
                 if path.suffix == ".html":
-                    written = inner.write_text(page_of(self._stage, self._codes, path.stem), encoding="utf-8") > 0
+                    written = file.write_text(page_of(self._stage, self._codes, path.stem), encoding="utf-8") > 0
                 else:
-                    written = self._stage.GetRootLayer().Export(str(inner))
+                    written = self._stage.GetRootLayer().Export(str(file))
                 if written and path.suffix == ".usdz":
                     package = Path(folder) / path.name
-                    written = UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(inner)), str(package))
-                    inner = package
+                    written = UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(file)), str(package))
+                    file = package
                 if not written:
                     raise InputError(f"{path}: cannot be written")
-                os.replace(inner, path)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+                os.replace(file, path)
         if known := Sdf.Layer.Find(str(path)):
             known.Reload(force=True)
 
 
 def _scene_of(source: Usd.Stage, swarms: Sequence[BallInstancer], rate: float) -> Sdf.Layer:
-    """Return the scene without the layers of runs, as one layer with ``rate`` time codes per second.
-
-    The layer has a prim for each instance, as in the run; for ``swarms`` only for balls that differ from all others.
-    """
+    """Return the scene without the layers of runs, as one layer with ``rate`` time codes per second."""
+    # the layer has a prim for each instance, as in the run; of ``swarms`` only for balls that differ from all others
     root = source.GetRootLayer()
     top = Sdf.Layer.CreateAnonymous(".usda")
     for key in copied_metadata(root):
@@ -348,9 +317,9 @@ def _scene_of(source: Usd.Stage, swarms: Sequence[BallInstancer], rate: float) -
     for layer in stage.GetUsedLayers():
         if "warpmag" in layer.customLayerData:
             stage.MuteLayer(layer.identifier)
-    whole = {swarm.path for swarm in swarms}
-    apart = expand_instancers(stage, stage.GetStartTimeCode(), defer=True)
-    complete_instances([instance for instance in apart if str(instance.instancer) not in whole])
+    kept = {swarm.path for swarm in swarms}
+    instances = expand_instancers(stage, stage.GetStartTimeCode(), defer=True)
+    complete_instances([instance for instance in instances if str(instance.instancer) not in kept])
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         while instances := [prim for prim in stage.Traverse() if prim.IsInstance()]:
             for prim in instances:
@@ -359,12 +328,12 @@ def _scene_of(source: Usd.Stage, swarms: Sequence[BallInstancer], rate: float) -
 
 
 def _strip(
-    layer: Sdf.Layer, dropped: Sequence[Sdf.Path], drawn: Collection[str] = (), below: Sdf.Path | str = "/"
+    layer: Sdf.Layer, dropped: Collection[Sdf.Path], drawn: Collection[str] = (), below: Sdf.Path | str = "/"
 ) -> None:
     """Remove prims and all physics from a layer, and prims that are then empty and not ``drawn``."""
     paths: list[Sdf.Path] = []
     layer.Traverse(Sdf.Path(below), lambda path: paths.append(path) if path.IsPrimPath() else None)
-    gone = set(dropped)
+    dropped = set(dropped)
     for path in paths:  # children come before their parents
         spec = layer.GetPrimAtPath(path)
         if spec is None:
@@ -372,15 +341,15 @@ def _strip(
         physical = spec.typeName.startswith(("Physics", "Newton")) or spec.specifier == Sdf.SpecifierClass
         schemas = spec.GetInfo("apiSchemas")
         body = schemas and "PhysicsRigidBodyAPI" in schemas.GetAddedOrExplicitItems()
-        if physical or path in gone or (body and not spec.nameChildren and str(path) not in drawn):
-            parent = spec.nameParent or layer.pseudoRoot
-            del parent.nameChildren[spec.name]
+        siblings = (spec.nameParent or layer.pseudoRoot).nameChildren
+        if physical or path in dropped or (body and not spec.nameChildren and str(path) not in drawn):
+            del siblings[spec.name]
             continue
         if schemas:
             kept = [name for name in schemas.GetAddedOrExplicitItems() if not name.startswith(_SCHEMAS)]
             spec.SetInfo("apiSchemas", Sdf.TokenListOp.CreateExplicit(kept))
         if spec.typeName == "Scope" and not spec.nameChildren and not spec.properties:
-            del (spec.nameParent or layer.pseudoRoot).nameChildren[spec.name]
+            del siblings[spec.name]
             continue
         for attribute in list(spec.properties):
             if attribute.name.startswith(_SIMULATION_PREFIXES):
@@ -399,33 +368,28 @@ def _body_of(prim: Usd.Prim) -> Usd.Prim | None:
 def _drawn_shape(prim: Usd.Prim, surface: Shape, row: int, frame: np.ndarray) -> DrawnShape:
     image = UsdGeom.Imageable(prim)
     drawn = image.ComputeVisibility() != UsdGeom.Tokens.invisible and image.ComputePurpose() in _PURPOSES
-    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
-    color = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get()
-    looks = (str(material.GetPath()) if material else "", tuple(color[0]) if color else ())
+    material, color = bound_material(prim), UsdGeom.Gprim(prim).GetDisplayColorAttr().Get()
+    appearance = (str(material.GetPath()) if material else "", tuple(color[0]) if color else ())
     gram, radius = frame[:3, :3] @ frame[:3, :3].T, 0.0
     if prim.IsA(UsdGeom.Sphere) and np.allclose(gram, gram[0, 0] * np.eye(3), rtol=0.0, atol=1e-5 * gram[0, 0]):
         radius = float(np.sqrt(gram[0, 0])) * prim.GetAttribute("radius").Get()
         if row < 0 or np.abs(frame[3, :3]).max() < 1e-6 * radius:
-            return DrawnShape(str(prim.GetPath()), row, frame, drawn, radius, np.zeros((0, 3)), [], looks)
+            return DrawnShape(str(prim.GetPath()), row, frame, drawn, radius, np.zeros((0, 3)), [], appearance)
     points, faces = surface
     points = np.c_[points, np.ones(len(points))] @ frame[:, :3]
-    return DrawnShape(str(prim.GetPath()), row, frame, drawn, 0.0, points, faces, looks)
+    return DrawnShape(str(prim.GetPath()), row, frame, drawn, 0.0, points, faces, appearance)
 
 
-def _key(shape: DrawnShape, with_looks: bool) -> tuple:
+def _key(shape: DrawnShape, with_appearance: bool) -> tuple:
     """Return the key of a shape's prototype: shapes with equal keys share one."""
-    looks = shape.looks if with_looks else ()
+    appearance = shape.appearance if with_appearance else ()
     if shape.radius:
-        return ("ball", looks)
+        return ("ball", appearance)
     size = max(shape.size, 1e-30)
-    return (np.round(shape.points / size, _DIGITS).tobytes(), round(float(np.log(size)), _DIGITS), looks)
+    return (np.round(shape.points / size, _DIGITS).tobytes(), round(float(np.log(size)), _DIGITS), appearance)
 
 
-def _prototype_path(path: Sdf.Path, number: int) -> Sdf.Path:
-    return path.AppendPath(f"Prototypes/Shape_{number:03d}")
-
-
-def _bake(mesh: UsdGeom.Mesh, shape: DrawnShape) -> None:
+def _transform_to_body(mesh: UsdGeom.Mesh, shape: DrawnShape) -> None:
     """Transform the points and normals of a mesh into the frame of its body, and remove the mesh's own transform."""
     mesh.ClearXformOpOrder()
     spec = mesh.GetPrim().GetPrimStack()[0]
@@ -435,8 +399,8 @@ def _bake(mesh: UsdGeom.Mesh, shape: DrawnShape) -> None:
     for name in ("normals", "primvars:normals"):
         normals = mesh.GetPrim().GetAttribute(name)
         if normals and normals.Get() is not None:
-            turned = np.array(normals.Get(), dtype=float) @ np.linalg.inv(shape.frame[:3, :3]).T
-            turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-30)
-            normals.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(turned, dtype=np.float32)))
+            values = np.array(normals.Get(), dtype=float) @ np.linalg.inv(shape.frame[:3, :3]).T
+            values /= np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-30)
+            normals.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32)))
     box = shape.points.min(axis=0), shape.points.max(axis=0)
-    mesh.CreateExtentAttr([Gf.Vec3f(*side.tolist()) for side in box])
+    mesh.CreateExtentAttr([Gf.Vec3f(*corner.tolist()) for corner in box])

@@ -77,11 +77,11 @@ class Display:
 
     def frame(self) -> None:
         """Place the camera where it sees all bodies of the model in their initial state, in all worlds shown."""
-        points, radii = self._places(self._model.state())
-        if not len(points):
+        centers, radii = self._bounding_balls(self._model.state())
+        if not len(centers):
             return
-        center = 0.5 * ((points - radii[:, None]).min(axis=0) + (points + radii[:, None]).max(axis=0))
-        reach = float((np.linalg.norm(points - center, axis=1) + radii).max())
+        center = 0.5 * ((centers - radii[:, None]).min(axis=0) + (centers + radii[:, None]).max(axis=0))
+        reach = float((np.linalg.norm(centers - center, axis=1) + radii).max())
         up = int(self._model.up_axis)
         east, north = (up + 1) % 3, (up + 2) % 3
         if up == 1:  # the yaw of viewers has the other sign about y
@@ -92,13 +92,13 @@ class Display:
         yaw = math.degrees(math.atan2(-direction[1], -direction[0]))
         self.viewer.set_camera(wp.vec3(*position), math.degrees(-math.asin(direction[2])), yaw)
 
-    def _places(self, state: newton.State) -> tuple[np.ndarray, np.ndarray]:
+    def _bounding_balls(self, state: newton.State) -> tuple[np.ndarray, np.ndarray]:
         """Return centers [m], shape [n, 3], and radii [m], shape [n], of shapes on bodies and of magnets."""
         model = self._model
         bodies, radii = model.shape_body.numpy(), model.shape_collision_radius.numpy()
-        seen = (bodies >= 0) & (model.shape_flags.numpy() & int(newton.ShapeFlags.VISIBLE) != 0)
-        seen[self._magnetics.shapes] = True
-        shapes = np.flatnonzero(seen & (radii < 1e5))  # without infinite planes
+        shown = (bodies >= 0) & (model.shape_flags.numpy() & int(newton.ShapeFlags.VISIBLE) != 0)
+        shown[self._magnetics.shapes] = True
+        shapes = np.flatnonzero(shown & (radii < 1e5))  # without infinite planes
         centers = _in_world(state, bodies[shapes], model.shape_transform.numpy()[shapes].astype(float))
         return centers + self._offsets(model.shape_world.numpy()[shapes]), radii[shapes].astype(float)
 
@@ -157,11 +157,11 @@ class Display:
         centers = _in_world(state, self._bodies, self._frames) + self._offsets(self._worlds)
         halves = _LENGTH * self._radii[:, None] * magnetizations / largest
         colors = np.stack([np.interp(strengths / largest, (0.0, 0.5, 1.0), channel) for channel in _COLORS.T], axis=1)
-        starts, ends, colors = (
+        arrays = (
             wp.array(np.ascontiguousarray(rows, np.float32), dtype=wp.vec3, device=self._model.device)
             for rows in (centers - halves, centers + halves, colors)
         )
-        self.viewer.log_arrows("/magnetization", starts, ends, colors, width=0.1 * float(np.median(self._radii)))
+        self.viewer.log_arrows("/magnetization", *arrays, width=0.1 * float(np.median(self._radii)))
 
 
 def _in_world(state: newton.State, bodies: np.ndarray, frames: np.ndarray) -> np.ndarray:
@@ -171,5 +171,5 @@ def _in_world(state: newton.State, bodies: np.ndarray, frames: np.ndarray) -> np
         return points.copy()
     poses = state.body_q.numpy()[np.maximum(bodies, 0)].astype(float)
     axis, real = poses[:, 3:6], poses[:, 6:]
-    turned = points + 2.0 * np.cross(axis, np.cross(axis, points) + real * points)
-    return np.where(bodies[:, None] >= 0, poses[:, :3] + turned, points)
+    rotated = points + 2.0 * np.cross(axis, np.cross(axis, points) + real * points)
+    return np.where(bodies[:, None] >= 0, poses[:, :3] + rotated, points)

@@ -10,11 +10,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdShade, Vt
+from pxr import Usd, UsdGeom, Vt
 
 from warpmag.errors import InputError, extra
 from warpmag.show.glb import glb
-from warpmag.show.meshes import corner_normals, shape_of
+from warpmag.show.materials import bound_material, surface_value
+from warpmag.show.meshes import corner_normals, shape_of, triangles_of
 from warpmag.usd.read.transforms import rigid_part, rotation_of
 
 _REACH = 2.0
@@ -32,8 +33,8 @@ _GRAY = (0.5, 0.5, 0.5)
 
 
 @dataclass(frozen=True)
-class _Look:
-    """Material of a mesh: linear RGB, metalness and roughness."""
+class _Surface:
+    """Surface of a mesh: linear RGB, metalness and roughness."""
 
     color: tuple[float, ...] = _GRAY
     metallic: float = 0.0
@@ -42,37 +43,22 @@ class _Look:
 
 @dataclass(frozen=True)
 class _Batch:
-    """Copies of one mesh over time; f is 1 for constant arrays.
+    """Copies of one mesh over time; f is 1 for constant arrays."""
 
-    Attributes:
-        points: Points of the mesh, shape [n, 3].
-        faces: Corners of each face.
-        positions: Positions of the copies, shape [f, k, 3].
-        turns: Quaternions x y z w, shape [f, k, 4].
-        scales: Scale factors, shape [f, k].
-        palette: Looks of the copies.
-        looks: Index of each copy's look in the palette, shape [f, k].
-    """
-
-    points: np.ndarray
-    faces: list[np.ndarray]
-    positions: np.ndarray
-    turns: np.ndarray
-    scales: np.ndarray
-    palette: list[_Look]
-    looks: np.ndarray
+    points: np.ndarray  # of the mesh, shape [n, 3]
+    faces: list[np.ndarray]  # corners of each face
+    positions: np.ndarray  # of the copies, shape [f, k, 3]
+    orientations: np.ndarray  # quaternions x y z w, shape [f, k, 4]
+    scales: np.ndarray  # scale factors, shape [f, k]
+    palette: list[_Surface]
+    surfaces: np.ndarray  # index of each copy's surface in the palette, shape [f, k]
 
 
 def page_of(stage: Usd.Stage, codes: np.ndarray, title: str) -> str:
     """Return the HTML of a stage's page, which needs neither a server nor a network.
 
-    Args:
-        stage: Stage of :class:`RendererStage`: meshes, PointInstancers of meshes and BasisCurves.
-        codes: Time codes to show, shape [f].
-        title: Title of the page.
-
-    Raises:
-        InputError: viser is missing, or has no free port to listen on.
+    The stage is one of :class:`RendererStage`: meshes, PointInstancers of meshes and BasisCurves. The page shows the
+    time codes, shape [f]. Raises :class:`InputError` if viser is missing, or has no free port to listen on.
     """
     try:
         import viser  # noqa: PLC0415 - an extra
@@ -109,29 +95,28 @@ def _instances(stage: Usd.Stage, codes: np.ndarray) -> Iterator[_Batch]:
         instancer = UsdGeom.PointInstancer(prim)
         meshes = [stage.GetPrimAtPath(path) for path in instancer.GetPrototypesRel().GetTargets()]
         shapes = [shape_of(mesh) for mesh in meshes]
-        palette = [_look_of(mesh) for mesh in meshes]
+        palette = [_surface_of(mesh) for mesh in meshes]
         groups: dict[bytes, int] = {}
         group = np.array([groups.setdefault(points.tobytes(), len(groups)) for points, _ in shapes])
         positions = _values(instancer.GetPositionsAttr(), codes, Vt.Vec3fArray)
-        kinds = _values(instancer.GetProtoIndicesAttr(), codes, Vt.IntArray)
-        count = kinds.shape[1]
-        turns = _values(
-            instancer.GetOrientationsAttr(), codes, Vt.QuathArray, np.tile((0.0, 0.0, 0.0, 1.0), (count, 1))
-        )
-        scales = _values(instancer.GetScalesAttr(), codes, Vt.Vec3fArray, np.ones((count, 3)))[..., 0]
+        prototypes = _values(instancer.GetProtoIndicesAttr(), codes, Vt.IntArray)
+        upright = np.tile((0.0, 0.0, 0.0, 1.0), (prototypes.shape[1], 1))
+        orientations = _values(instancer.GetOrientationsAttr(), codes, Vt.QuathArray, upright)
+        scales = _values(instancer.GetScalesAttr(), codes, Vt.Vec3fArray, np.ones_like(upright))[..., 0]
         for number in range(len(groups)):
-            own = group[kinds[0]] == number
             points, faces = shapes[int(np.argmax(group == number))]
-            yield _Batch(points, faces, positions[:, own], turns[:, own], scales[:, own], palette, kinds[:, own])
+            members = group[prototypes[0]] == number
+            arrays = (array[:, members] for array in (positions, orientations, scales))
+            yield _Batch(points, faces, *arrays, palette, prototypes[:, members])
 
 
 def _meshes(stage: Usd.Stage, codes: np.ndarray) -> Iterator[_Batch]:
     """Return the meshes that are not prototypes, one batch each."""
     transforms = [UsdGeom.XformCache(code) for code in codes.tolist()]
-    todo = iter(Usd.PrimRange(stage.GetPseudoRoot()))
-    for prim in todo:
+    prims = iter(Usd.PrimRange(stage.GetPseudoRoot()))
+    for prim in prims:
         if prim.IsA(UsdGeom.PointInstancer):
-            todo.PruneChildren()
+            prims.PruneChildren()
         surface = shape_of(prim) if prim.IsA(UsdGeom.Mesh) else None
         if surface is None or UsdGeom.Imageable(prim).ComputeVisibility(codes[0]) == UsdGeom.Tokens.invisible:
             continue
@@ -139,25 +124,23 @@ def _meshes(stage: Usd.Stage, codes: np.ndarray) -> Iterator[_Batch]:
         if (frames == frames[0]).all():
             frames = frames[:1]
         poses = [rigid_part(frame) for frame in frames]
-        own = frames[0] @ np.linalg.inv(poses[0])
-        points = np.c_[surface[0], np.ones(len(surface[0]))] @ own[:, :3]
-        faces = [face[::-1] for face in surface[1]] if np.linalg.det(own) < 0.0 else surface[1]
-        turns = np.array([rotation_of(pose) for pose in poses])[:, None]
-        still = np.zeros((1, 1), dtype=int)
-        yield _Batch(points, faces, frames[:, None, 3, :3], turns, still + 1.0, [_look_of(prim)], still)
+        scaling = frames[0] @ np.linalg.inv(poses[0])
+        points = np.c_[surface[0], np.ones(len(surface[0]))] @ scaling[:, :3]
+        faces = [face[::-1] for face in surface[1]] if np.linalg.det(scaling) < 0.0 else surface[1]
+        orientations = np.array([rotation_of(pose) for pose in poses])[:, None]
+        positions, scale, index = frames[:, None, 3, :3], np.ones((1, 1)), np.zeros((1, 1), dtype=int)
+        yield _Batch(points, faces, positions, orientations, scale, [_surface_of(prim)], index)
 
 
-def _look_of(prim: Usd.Prim) -> _Look:
-    """Return the look of a mesh from its UsdPreviewSurface, or from its display color."""
-    color = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get()
-    look = {"color": tuple(color[0])} if color else {}
-    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
-    shader = material.ComputeSurfaceSource()[0] if material else None
-    for name, own in (("diffuseColor", "color"), ("metallic", "metallic"), ("roughness", "roughness")):
-        value = shader.GetInput(name).Get() if shader and shader.GetInput(name) else None
+def _surface_of(prim: Usd.Prim) -> _Surface:
+    """Return the surface of a mesh from its UsdPreviewSurface, or from its display color."""
+    color, material = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get(), bound_material(prim)
+    values = {"color": tuple(color[0])} if color else {}
+    for name, key in (("diffuseColor", "color"), ("metallic", "metallic"), ("roughness", "roughness")):
+        value = surface_value(material, name)
         if value is not None:
-            look[own] = tuple(value) if own == "color" else float(value)
-    return _Look(**look)
+            values[key] = tuple(value) if key == "color" else float(value)
+    return _Surface(**values)
 
 
 def _values(attribute: Usd.Attribute, codes: np.ndarray, array, default: np.ndarray | None = None) -> np.ndarray:
@@ -173,10 +156,10 @@ def _box(batches: list[_Batch]) -> np.ndarray:
     moving = [batch for batch in batches if len(batch.positions) > 1] or batches
     lows, highs = [], []
     for batch in moving:
-        places = batch.positions[[0, -1]].reshape(-1, 3)
+        positions = batch.positions[[0, -1]].reshape(-1, 3)
         size = float(batch.scales.max()) * np.linalg.norm(batch.points, axis=1).max()
-        lows.append(np.quantile(places, _OUTSIDE, axis=0) - size)
-        highs.append(np.quantile(places, 1.0 - _OUTSIDE, axis=0) + size)
+        lows.append(np.quantile(positions, _OUTSIDE, axis=0) - size)
+        highs.append(np.quantile(positions, 1.0 - _OUTSIDE, axis=0) + size)
     return np.array([np.min(lows, axis=0), np.max(highs, axis=0)])
 
 
@@ -188,7 +171,7 @@ def _scale(batches: list[_Batch]) -> float:
 def _put_camera(server, stage: Usd.Stage, batches: list[_Batch], scale: float) -> None:
     """Aim the camera at the moving bodies, from the direction of the stage's camera."""
     up = 1 if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else 2
-    middle = scale * _box(batches).mean(axis=0) if batches else np.zeros(3)
+    target = scale * _box(batches).mean(axis=0) if batches else np.zeros(3)
     cameras = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
     if cameras:
         frame = np.array(UsdGeom.XformCache(stage.GetStartTimeCode()).GetLocalToWorldTransform(cameras[0]))
@@ -198,29 +181,28 @@ def _put_camera(server, stage: Usd.Stage, batches: list[_Batch], scale: float) -
     direction = direction / np.linalg.norm(direction)
     server.scene.set_up_direction("+y" if up == 1 else "+z")
     server.initial_camera.fov = _FIELD_OF_VIEW
-    server.initial_camera.position = middle + _REACH / math.sin(0.5 * _FIELD_OF_VIEW) * direction
-    server.initial_camera.look_at = middle
+    server.initial_camera.position = target + _REACH / math.sin(0.5 * _FIELD_OF_VIEW) * direction
+    server.initial_camera.look_at = target
 
 
 def _add_batch(scene, name: str, batch: _Batch, scale: float) -> Callable[[int], None]:
     """Add meshes at the first frame; return a function that shows them at a given frame."""
     points, normals, triangles = _corners(batch.points, batch.faces)
-    looks = [batch.palette[look] for look in np.unique(batch.looks).tolist()]
-    placed = {"positions": batch.positions, "wxyzs": batch.turns[..., [3, 0, 1, 2]], "scales": batch.scales}
-    if len(looks) == 1:
-        surface = {"color": looks[0].color, "metallic": looks[0].metallic, "roughness": looks[0].roughness}
-        add = functools.partial(scene.add_batched_glb, name, glb(points, normals, triangles, **surface))
+    surfaces = [batch.palette[surface] for surface in np.unique(batch.surfaces).tolist()]
+    arrays = {"positions": batch.positions, "wxyzs": batch.orientations[..., [3, 0, 1, 2]], "scales": batch.scales}
+    if len(surfaces) == 1:
+        add = functools.partial(scene.add_batched_glb, name, glb(points, normals, triangles, **vars(surfaces[0])))
     else:  # a color per copy, without metalness
-        colors = np.array([look.color for look in batch.palette]) ** (1.0 / 2.2)
-        placed["colors"] = np.rint(255.0 * colors[batch.looks]).astype(np.uint8)
+        colors = np.array([surface.color for surface in batch.palette]) ** (1.0 / 2.2)
+        arrays["colors"] = np.rint(255.0 * colors[batch.surfaces]).astype(np.uint8)
         add = functools.partial(scene.add_batched_meshes_simple, name, points, triangles)
-    placed = {f"batched_{key}": value for key, value in placed.items()}
+    arrays = {f"batched_{key}": value for key, value in arrays.items()}
     share = _FAR_TRIANGLES / (len(triangles) * batch.positions.shape[1])
     radius = scale * float(np.linalg.norm(points, axis=1).max()) * float(batch.scales[0].max())
     detail = "off" if share >= 1.0 else ((_FAR_RADII * radius, share),)
     solid = bool(np.ptp(points, axis=0).min() > 0.0)  # a flat ground would cast a shadow on itself
-    handle = add(**{key: value[0] for key, value in placed.items()}, scale=scale, lod=detail, cast_shadow=solid)
-    moving = {key: value for key, value in placed.items() if len(value) > 1}
+    handle = add(**{key: value[0] for key, value in arrays.items()}, scale=scale, lod=detail, cast_shadow=solid)
+    moving = {key: value for key, value in arrays.items() if len(value) > 1}
 
     def show(frame: int) -> None:
         for key, value in moving.items():
@@ -231,11 +213,11 @@ def _add_batch(scene, name: str, batch: _Batch, scale: float) -> Callable[[int],
 
 def _corners(points: np.ndarray, faces: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return points, normals and triangles of a surface; points of sharp edges occur once per side."""
-    both = np.c_[points[np.concatenate(faces)], corner_normals(points, faces)].astype(np.float32)
-    kept, first = np.unique(np.round(both, 6), axis=0, return_inverse=True)
+    corners = np.c_[points[np.concatenate(faces)], corner_normals(points, faces)].astype(np.float32)
+    vertices, indices = np.unique(np.round(corners, 6), axis=0, return_inverse=True)
     starts = np.cumsum([0, *(len(face) for face in faces)]).tolist()
-    fans = [(at, k, k + 1) for at, end in itertools.pairwise(starts) for k in range(at + 1, end - 1)]
-    return kept[:, :3], kept[:, 3:], first.reshape(-1)[np.array(fans)].astype(np.uint32)
+    triangles = triangles_of([range(start, end) for start, end in itertools.pairwise(starts)])
+    return vertices[:, :3], vertices[:, 3:], indices.reshape(-1)[triangles].astype(np.uint32)
 
 
 def _add_curves(scene, prim: Usd.Prim, codes: np.ndarray, scale: float) -> Callable[[int], None]:
@@ -245,7 +227,7 @@ def _add_curves(scene, prim: Usd.Prim, codes: np.ndarray, scale: float) -> Calla
     counts = np.array(curves.GetCurveVertexCountsAttr().Get())
     begins = np.delete(np.arange(points.shape[1]), np.cumsum(counts) - 1)
     segments = np.stack([points[:, begins], points[:, begins + 1]], axis=2)
-    color = np.rint(255.0 * np.array(_look_of(prim).color) ** (1.0 / 2.2)).astype(np.uint8)
+    color = np.rint(255.0 * np.array(_surface_of(prim).color) ** (1.0 / 2.2)).astype(np.uint8)
     width = scale * float(curves.GetWidthsAttr().Get()[0])
     handle = scene.add_line_segments(str(prim.GetPath()), segments[0], color, thickness=width, scale=scale)
 
