@@ -60,8 +60,8 @@ def _packing(cells):
 def _heap(count):
     """A cone of touching balls."""
     x = _packing((8, 8, 4))
-    middle = x.mean(axis=0)
-    height = np.hypot(x[:, 0] - middle[0], x[:, 1] - middle[1]) + x[:, 2]
+    center = x.mean(axis=0)
+    height = np.hypot(x[:, 0] - center[0], x[:, 1] - center[1]) + x[:, 2]
     return x[np.argsort(height, kind="stable")[:count]]
 
 
@@ -78,10 +78,10 @@ def _uniform(positions, strength, radii=RADIUS, **material):
 
 
 def _dipole(positions, moment, **material):
-    """Arrangement under a dipole [A·m²], two centimeters above its top and off its middle."""
+    """Arrangement under a dipole [A·m²], two centimeters above its top and off its center."""
     x = np.asarray(positions, np.float32).astype(float)
-    middle = x.mean(axis=0)
-    source = np.array([[middle[0] + 0.003, middle[1] + 0.001, x[:, 2].max() + 0.02]])
+    center = x.mean(axis=0)
+    source = np.array([[center[0] + 0.003, center[1] + 0.001, x[:, 2].max() + 0.02]])
     applied = oracle.h_field(source, np.array([[0.2 * moment, 0.0, moment]]), x)
     return Arrangement(x, applied, RADIUS, {"saturation": SATURATION, **material})
 

@@ -78,12 +78,12 @@ def author(
     shapes = {letter: _define_letter(stage, letter, iron, size, thickness) for letter in used}
     widths, heights = np.max([extent for extent, _ in shapes.values()], axis=0)
     pitch = np.array([_GAP * widths, _GAP * size, _GAP * heights])
-    middle = 0.5 * (np.array([columns, layers, rows]) - 1.0)
+    center = 0.5 * (np.array([columns, layers, rows]) - 1.0)
     UsdGeom.Scope.Define(stage, "/World/Letters")
     cells = itertools.product(range(layers), reversed(range(rows)), range(columns))
     for number, (layer, row, column) in enumerate(cells):
         letter = used[number % len(used)]
-        position = (np.array([column, layer, row]) - middle) * pitch
+        position = (np.array([column, layer, row]) - center) * pitch
         body = authoring.add_body(stage, f"/World/Letters/{letter}_{number:03d}", position).GetPrim()
         body.GetInherits().AddInherit(_class_of(letter))
         UsdPhysics.MassAPI.Apply(body).CreateMassAttr(authoring.IRON_DENSITY * shapes[letter][1])

@@ -38,16 +38,13 @@ _SOFT_BOXES = (
     ("Key", (-0.75, -0.4, 1.0), 0.8, 9.0, (1.0, 0.96, 0.9)),
     ("Rim", (0.9, 0.9, 0.6), 0.6, 8.0, (0.9, 0.95, 1.0)),
 )
-"""Name, place and side over the camera's distance, radiance, and linear RGB of each light."""
+"""Name, offset from the target and side over the camera's distance, radiance, and linear RGB of each light."""
 
 
 def new_stage(documentation: str, *, seconds: float, frames_per_second: float = 60.0) -> Usd.Stage:
-    """Return an empty stage in meters and kilograms with Z up and the default prim ``/World``.
+    """Return an empty stage in meters and kilograms with Z up, the default prim ``/World`` and a length [s].
 
-    Args:
-        documentation: Description of the scene; ``warpmag scenes`` prints the first line.
-        seconds: Length of the scene [s].
-        frames_per_second: Output rate [Hz], and time codes per second.
+    ``warpmag scenes`` prints the first line of the ``documentation``. The output rate [Hz] is also that of time codes.
     """
     stage = Usd.Stage.CreateInMemory()
     metadata = {"metersPerUnit": 1.0, "kilogramsPerUnit": 1.0, "upAxis": "Z", "documentation": documentation}
@@ -102,15 +99,8 @@ def add_material(
 ) -> UsdShade.Material:
     """Author a material for physics and rendering, ``/World/Materials/NAME``.
 
-    Args:
-        stage: The stage.
-        name: Name of the prim.
-        color: Linear RGB.
-        metallic: Metalness, 0 to 1.
-        roughness: Roughness, 0 to 1.
-        coat: Weight of a clear coat, 0 to 1.
-        density: Mass density [kg/m³] of bodies with this material.
-        friction: Static and dynamic friction. If positive, rolling and torsional friction are :data:`CONTACT_PATCH`.
+    The color is linear RGB; metalness, roughness and clear coat are 0 to 1. The density [kg/m³] is that of bodies with
+    this material. With static and dynamic friction, rolling and torsional friction are :data:`CONTACT_PATCH`, else 0.
     """
     UsdGeom.Scope.Define(stage, "/World/Materials")
     material = UsdShade.Material.Define(stage, f"/World/Materials/{name}")
@@ -280,14 +270,14 @@ def _add_lights(stage: Usd.Stage, target: Sequence[float], distance: float) -> N
     sky = UsdLux.DomeLight.Define(stage, "/World/Lights/Sky")
     sky.CreateIntensityAttr(0.35)
     sky.CreateColorAttr(Gf.Vec3f(0.86, 0.93, 1.0))
-    for name, place, side, intensity, color in _SOFT_BOXES:
+    for name, offset, side, intensity, color in _SOFT_BOXES:
         box = UsdLux.RectLight.Define(stage, f"/World/Lights/{name}")
         box.CreateWidthAttr(side * distance)
         box.CreateHeightAttr(side * distance)
         box.CreateIntensityAttr(intensity)
         box.CreateNormalizeAttr(False)
         box.CreateColorAttr(Gf.Vec3f(*color))
-        box.MakeMatrixXform().Set(_look_at(np.add(target, np.multiply(distance, place)), target))
+        box.MakeMatrixXform().Set(_look_at(np.add(target, np.multiply(distance, offset)), target))
         box.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(box, Usd.TimeCode.Default()))
 
 

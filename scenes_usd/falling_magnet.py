@@ -67,14 +67,7 @@ def stack(count: int, layers: int, radius: float) -> np.ndarray:
     """Return the positions of balls in a round stack, each above the gap between four balls of the layer below.
 
     The balls fill the lowest cone with a slope of 45 degrees that holds them, so that four balls support each ball.
-
-    Args:
-        count: Number of balls.
-        layers: Largest number of layers.
-        radius: Radius of the balls [m].
-
-    Returns:
-        Centers [m], shape [count, 3], from the ground up.
+    There are at most ``layers`` layers. Positions [m] have the shape [count, 3], from the ground up.
     """
     pitch = authoring.BALL_SPACING * radius
     rise = pitch / math.sqrt(2.0)

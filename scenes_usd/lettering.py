@@ -39,7 +39,7 @@ class Box:
 def outline(letter: str, segments: int = 4) -> list[np.ndarray]:
     """Return the corners of the closed curves that bound a letter, with the material on their left, shape [n, 2] each.
 
-    The first corner is not repeated. The origin is the middle of the bounding box. Each curved piece is divided into
+    The first corner is not repeated. The origin is the center of the bounding box. Each curved piece is divided into
     ``segments`` straight ones. Raises :class:`InputError` if Matplotlib is missing, or the letter has no outline.
     """
     if not letter.strip():
@@ -61,10 +61,10 @@ def outline(letter: str, segments: int = 4) -> list[np.ndarray]:
         if code == path.CLOSEPOLY:
             curves.append(_cleaned(np.array(corners)))
             corners = []
-    middle = 0.5 * (np.concatenate(curves).min(axis=0) + np.concatenate(curves).max(axis=0))
+    center = 0.5 * (np.concatenate(curves).min(axis=0) + np.concatenate(curves).max(axis=0))
     if area(curves) < 0.0:  # TrueType has the opposite orientation
         curves = [curve[::-1] for curve in curves]
-    return [curve - middle for curve in curves]
+    return [curve - center for curve in curves]
 
 
 def area(curves: list[np.ndarray]) -> float:

@@ -119,14 +119,7 @@ def _add_tree(stage, tree, bark, bud, bud_radius, magnetization) -> None:
 
 
 def grow(branches: int, height: float, bud_radius: float, random: np.random.Generator) -> Tree:
-    """Grow a tree.
-
-    Args:
-        branches: Largest number of points of the crown.
-        height: Height [m].
-        bud_radius: Radius of the buds [m], which do not touch each other.
-        random: Generator of the points of the crown.
-    """
+    """Grow a tree of a height [m] to at most ``branches`` random points of its crown; buds do not touch each other."""
     if not 0.0 < bud_radius < 0.5 * _STEP * height:
         raise InputError(f"bud_radius: must be positive and below {0.5 * _STEP * height:g} m, got {bud_radius:g}")
     targets = _crown(branches, random)
@@ -200,17 +193,9 @@ def _radii(parents, twig) -> np.ndarray:
 
 
 def rain(count: int, radius: float, spacing: float, height: float, random: np.random.Generator) -> np.ndarray:
-    """Return random positions of balls above the tree.
+    """Return random centers of balls [m] above a tree of a height [m], from the lowest up, shape [count, 3].
 
-    Args:
-        count: Number of balls.
-        radius: Radius of the balls [m].
-        spacing: Edge of the mean volume per ball [m].
-        height: Height of the tree [m].
-        random: Generator of the positions.
-
-    Returns:
-        Centers [m], shape [count, 3], from the lowest up.
+    ``spacing`` is the edge of the mean volume per ball [m].
     """
     least = _BALL_DISTANCE * spacing
     if least < authoring.BALL_SPACING * radius:

@@ -220,15 +220,15 @@ def _check(options) -> int:
     bodies, kinematic, colliders = map(len, (contents.bodies, contents.kinematic, contents.colliders))
     print(f"bodies      {bodies} ({kinematic} kinematic), {colliders} colliders")
     print(f"magnets     {len(report.magnets('inducible'))} inducible, {len(report.magnets('permanent'))} permanent")
-    sources = [source for placed in contents.sources.values() for source in placed]
+    sources = [source for group in contents.sources.values() for source in group]
     currents = sum(source.currents is not None for source in sources)
     if contents.motions or contents.magnetization_keys or contents.field_keys or currents:
         fields = f", {currents} currents" if currents else ""
         fields += ", the external field" if contents.field_keys else ""
         print(f"keyed       {len(contents.motions)} bodies, {len(contents.magnetization_keys)} magnetizations{fields}")
     if sources:
-        kinds = [type(source.source).__name__ for source in sources]
-        print(f"sources     {kinds.count('Coil')} coils, {kinds.count('FieldMap')} field maps")
+        types = [type(source.source).__name__ for source in sources]
+        print(f"sources     {types.count('Coil')} coils, {types.count('FieldMap')} field maps")
     settings = contents.settings
     field = ", ".join(f"{value:g}" for value in settings.external_field)
     laws = f"{settings.force}, {settings.dynamics}, {settings.contact_model}"

@@ -15,7 +15,7 @@
 Two programs belong to them: ``body_moments`` prints the moments of bodies with their errors, ``near_contact_table``
 computes the table that ``warpmag.kernels.near_contact`` reads.
 
-Independence: no reference imports Warp, except ``body_moments``, ``fall`` and ``plate.model_forces``, which run warpmag
+Independence: no reference imports Warp, except ``body_moments``, ``fall`` and ``plate``, which run warpmag
 to compare it. ``near_contact``, ``near_contact_table`` and ``ball_in_field`` share with
 ``warpmag.kernels.near_contact.contact_table`` the constants that define the model; ``near_contact`` also reads the
 table by that module's ``gap_table``, ``b_spline`` and ``hardness``. ``spheres`` checks the table itself.

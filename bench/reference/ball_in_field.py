@@ -16,7 +16,7 @@ import itertools
 import numpy as np
 from scipy.special import sph_harm_y
 
-from bench.reference.near_contact import smoothstep
+from bench.reference.near_contact import ramp, smoothstep
 from bench.reference.oracle import MU0
 from warpmag.kernels.near_contact.contact_table import CELL_DEPTH, CELL_SIZE, LEAST_MAGNET, MAGNET_OVERLAP, MAGNET_REACH
 
@@ -28,9 +28,9 @@ def image_force(positions, charges, radius: float) -> np.ndarray:
     """
     x, q = np.asarray(positions, float), np.asarray(charges, float)
     s = np.linalg.norm(x, axis=1)
-    at = np.concatenate([x * (radius / s)[:, None] ** 2, np.zeros_like(x)])
+    sites = np.concatenate([x * (radius / s)[:, None] ** 2, np.zeros_like(x)])
     images = np.concatenate([-q * radius / s, q * radius / s])
-    r = at[:, None] - x[None]
+    r = sites[:, None] - x[None]
     field = np.einsum("n,inc->ic", q, r / np.linalg.norm(r, axis=2)[..., None] ** 3) / (4.0 * np.pi)
     return MU0 * images @ field
 
@@ -104,8 +104,7 @@ def model_weight(distance, radius, magnet_radius, alone):
     far = smoothstep((MAGNET_REACH[1] - rho) / (MAGNET_REACH[1] - MAGNET_REACH[0]))[0]
     shallow, deep = MAGNET_OVERLAP
     near = smoothstep((rho - 1.0 - (1.0 - deep) * depth) / ((deep - shallow) * depth))[0]
-    coarse = smoothstep((size - CELL_SIZE[0]) / (CELL_SIZE[1] - CELL_SIZE[0]))[0]
-    return far * near * np.where(alone, 1.0, 1.0 - coarse)
+    return far * near * np.where(alone, 1.0, 1.0 - ramp(size, CELL_SIZE))
 
 
 def model_energy(center, radius, susceptibility, positions, radii, moments, alone):
@@ -130,6 +129,6 @@ def model_energy(center, radius, susceptibility, positions, radii, moments, alon
         mixed += (among - a[:, None] * b - q * a[None]) * slope
         total += _response(degree, susceptibility) * np.sum(mixed / np.outer(d, d) ** (degree + 2.0))
     degree = np.arange(5, 400)[:, None]
-    own = (degree + 1.0) ** 2 * a**2 + 0.5 * degree * (degree + 1.0) * (np.sum(m * m, axis=1) - a**2)
-    total += _response(6.0, susceptibility) * np.sum((own * d ** (-2.0 * degree - 4.0))[:, alone])
+    single = (degree + 1.0) ** 2 * a**2 + 0.5 * degree * (degree + 1.0) * (np.sum(m * m, axis=1) - a**2)
+    total += _response(6.0, susceptibility) * np.sum((single * d ** (-2.0 * degree - 4.0))[:, alone])
     return -0.5 * MU0 / (4.0 * np.pi) * radius**3 * total

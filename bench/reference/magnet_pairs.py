@@ -56,18 +56,14 @@ def box_force(half1, half2, offset, magnetization1: float, magnetization2: float
 
 def _corner(u, v, w) -> np.ndarray:
     r = math.sqrt(u * u + v * v + w * w)
-    turn = math.atan2(u * v, r * w)
+    angle = math.atan2(u * v, r * w)
 
     def log(x):  # where r = x the factor of the logarithm is zero
         return math.log(r - x) if r > x else 0.0
 
-    return np.array(
-        [
-            0.5 * (v * v - w * w) * log(u) + u * v * log(v) + v * w * turn + 0.5 * r * u,
-            0.5 * (u * u - w * w) * log(v) + u * v * log(u) + u * w * turn + 0.5 * r * v,
-            -u * w * log(u) - v * w * log(v) + u * v * turn - r * w,
-        ]
-    )
+    x = 0.5 * (v * v - w * w) * log(u) + u * v * log(v) + v * w * angle + 0.5 * r * u
+    y = 0.5 * (u * u - w * w) * log(v) + u * v * log(u) + u * w * angle + 0.5 * r * v
+    return np.array([x, y, -u * w * log(u) - v * w * log(v) + u * v * angle - r * w])
 
 
 def cylinder_force(radius, height1, height2, gap, magnetization1: float, magnetization2: float) -> float:

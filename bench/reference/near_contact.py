@@ -7,30 +7,15 @@ those of the model.
 import numpy as np
 
 from bench.reference import oracle
-from warpmag.kernels.near_contact.contact_table import (
-    CONTACT_GAP,
-    DEEPEST,
-    FUNCTIONS,
-    LEAST_RATIO,
-    LOG_GAPS,
-    MOST_SHARED,
-    QUADRUPOLE_OVERLAP,
-    QUADRUPOLE_REACH,
-    RANGE,
-    REACH,
-    SMALLEST_GAP,
-    SOFTNESS,
-    b_spline,
-    gap_table,
-    hardness,
-)
+from warpmag.kernels.near_contact import contact_table
+from warpmag.kernels.near_contact.contact_table import b_spline, gap_table, hardness
 
 
 def log_gap(gap):
     """Logarithm of the gap [radii] at which the table is read, and its derivative; bounded below near contact."""
-    depth = np.minimum(gap - SMALLEST_GAP, 0.0) / SOFTNESS
-    outside = np.maximum(gap, SMALLEST_GAP)
-    value = np.log(outside) + SOFTNESS / SMALLEST_GAP * depth / np.sqrt(1.0 + depth**2)
+    depth = np.minimum(gap - contact_table.SMALLEST_GAP, 0.0) / contact_table.SOFTNESS
+    outside = np.maximum(gap, contact_table.SMALLEST_GAP)
+    value = np.log(outside) + contact_table.SOFTNESS / contact_table.SMALLEST_GAP * depth / np.sqrt(1.0 + depth**2)
     return value, (1.0 + depth**2) ** -1.5 / outside
 
 
@@ -40,7 +25,12 @@ def smoothstep(x):
     return x * x * (3.0 - 2.0 * x), 6.0 * x * (1.0 - x)
 
 
-def window(gap, far=CONTACT_GAP, deep=DEEPEST):
+def ramp(x, limits):
+    """Cubic step from 0 at ``limits[0]`` to 1 at ``limits[1]``."""
+    return smoothstep((x - limits[0]) / (limits[1] - limits[0]))[0]
+
+
+def window(gap, far=contact_table.CONTACT_GAP, deep=contact_table.DEEPEST):
     """Factor that fades from gap ``far[0]`` to ``far[1]`` and in overlaps beyond ``deep[0]``, and its derivative."""
     outer, outer_slope = smoothstep((far[1] - gap) / (far[1] - far[0]))
     inner, inner_slope = smoothstep((deep[1] + gap) / (deep[1] - deep[0]))
@@ -50,8 +40,8 @@ def window(gap, far=CONTACT_GAP, deep=DEEPEST):
 def quadrupole_window(distance, radius_i, radius_j):
     """Weight of the quadrupoles of two balls, and its derivative with respect to their distance."""
     unit = 0.5 * (radius_i + radius_j)
-    far = (QUADRUPOLE_REACH[0] - 2.0, QUADRUPOLE_REACH[1] - 2.0)
-    value, slope = window(distance / unit - 2.0, far, QUADRUPOLE_OVERLAP)
+    far = (contact_table.QUADRUPOLE_REACH[0] - 2.0, contact_table.QUADRUPOLE_REACH[1] - 2.0)
+    value, slope = window(distance / unit - 2.0, far, contact_table.QUADRUPOLE_OVERLAP)
     return value, slope / unit
 
 
@@ -63,11 +53,11 @@ def conductances(gap, own, other):
     """
     gap = np.asarray(gap, float)
     u, du = log_gap(gap)
-    row, weights, slopes = b_spline(u, LOG_GAPS)
-    value, slope = np.zeros((len(gap), FUNCTIONS)), np.zeros((len(gap), FUNCTIONS))
-    for kind in {*zip(own, other, strict=True)}:
-        rows = np.flatnonzero((own == kind[0]) & (other == kind[1]))
-        patch = gap_table(*map(float, kind))[row[rows, None] + np.arange(4)]
+    row, weights, slopes = b_spline(u, contact_table.LOG_GAPS)
+    value, slope = np.zeros((len(gap), contact_table.FUNCTIONS)), np.zeros((len(gap), contact_table.FUNCTIONS))
+    for pair in {*zip(own, other, strict=True)}:
+        rows = np.flatnonzero((own == pair[0]) & (other == pair[1]))
+        patch = gap_table(*map(float, pair))[row[rows, None] + np.arange(4)]
         value[rows] = np.einsum("pa,paf->pf", weights[rows], patch)
         slope[rows] = np.einsum("pa,paf->pf", slopes[rows], patch) * du[rows, None]
     w, dw = window(gap)
@@ -77,7 +67,7 @@ def conductances(gap, own, other):
 def similarity(radius_i, radius_j):
     """Weight of a pair of unequal balls, for which the table of equal balls is less accurate."""
     ratio = np.minimum(radius_i, radius_j) / np.maximum(radius_i, radius_j)
-    return smoothstep((ratio - LEAST_RATIO[0]) / (LEAST_RATIO[1] - LEAST_RATIO[0]))[0]
+    return ramp(ratio, contact_table.LEAST_RATIO)
 
 
 def shared_volume(distance, a, b):
@@ -89,7 +79,7 @@ def shared_volume(distance, a, b):
 
 def crowding_weight(shared):
     """Weight of a ball that shares the volume ``shared`` with others: 0 removes it from the model."""
-    return 1.0 - smoothstep((shared - MOST_SHARED[0]) / (MOST_SHARED[1] - MOST_SHARED[0]))[0]
+    return 1.0 - ramp(shared, contact_table.MOST_SHARED)
 
 
 # ---------- The short-range potential ----------
@@ -97,14 +87,14 @@ def crowding_weight(shared):
 
 def long_range(distance, radius_i, radius_j):
     """U_lr [1/m] of two balls and its radial factors g1, g2, g3, as ``oracle.radial_factors`` defines them."""
-    a, b = 0.5 * RANGE * radius_i, 0.5 * RANGE * radius_j
+    a, b = 0.5 * contact_table.RANGE * radius_i, 0.5 * contact_table.RANGE * radius_j
     d = np.asarray(distance, float)
     return averaged_potential(d, a, b), *oracle.radial_factors(d, a, b)
 
 
 def long_range_self(radius):
     """U_lr of a ball's source at the ball itself [1/m], and of its dipole [1/m³]."""
-    b = 0.5 * RANGE * radius
+    b = 0.5 * contact_table.RANGE * radius
     return 1.2 / b, 1.0 / b**3
 
 
@@ -114,11 +104,11 @@ def averaged_potential(d, a, b):
     k = 5.0 * delta2**2 * (delta2 + 6.0 * p)
     u1, u2, u3 = 45.0 * s**2 * delta2, -40.0 * s * (delta2 + p), 15.0 * (delta2 + 2.0 * p)
     join = 160.0 * p**3 / s - (k / s + u1 * s + u2 * s**2 + u3 * s**3 - s**5)
-    apart = np.where(d > np.abs(a - b), d, s)
-    polynomial = join + k / apart + u1 * d + u2 * d**2 + u3 * d**3 - d**5
+    separate = np.where(d > np.abs(a - b), d, s)
+    polynomial = join + k / separate + u1 * d + u2 * d**2 + u3 * d**3 - d**5
     large, small = np.maximum(a, b), np.minimum(a, b)
     inside = (3.0 * large**2 - d**2 - 0.6 * small**2) / (2.0 * large**3)
-    return np.select([d <= np.abs(a - b), d < s], [inside, polynomial / (160.0 * p**3)], 1.0 / apart)
+    return np.select([d <= np.abs(a - b), d < s], [inside, polynomial / (160.0 * p**3)], 1.0 / separate)
 
 
 # ---------- Reference implementation, dense ----------
@@ -160,7 +150,7 @@ class NearContacts:
         w = np.broadcast_to(np.asarray(weights, float), n).copy()
         self.polarizability = w / (1.0 + 2.5 / np.broadcast_to(np.asarray(susceptibility, float), n))
         r = self.positions[:, None] - self.positions[None]
-        reach = 0.5 * REACH * (self.radii[:, None] + self.radii[None])
+        reach = 0.5 * contact_table.REACH * (self.radii[:, None] + self.radii[None])
         self.i, self.j = np.nonzero(np.triu(np.linalg.norm(r, axis=2) < reach, 1))
         i, j = self.i, self.j
         self.separation = self.positions[j] - self.positions[i]
@@ -207,17 +197,17 @@ class NearContacts:
         block[:, 1:4, 0] = g1[:, None] * r
         block[:, 1:4, 1:4] = -g1[:, None, None] * np.eye(3) - g2[:, None, None] * r[:, :, None] * r[:, None, :]
         n = self.direction
-        turned = np.einsum("abk,pk->pab", _BASIS, n)
-        along = np.einsum("pak,pk->pa", turned, n)
+        projected = np.einsum("abk,pk->pab", _BASIS, n)
+        along = np.einsum("pak,pk->pa", projected, n)
         d = self.distance[:, None, None]
         shape = along * (g2 * self.distance**2)[:, None] / 3.0
         block[:, 0, 4:] = shape * self.quadrupole[0][:, None]
         block[:, 4:, 0] = shape * self.quadrupole[0][:, None]
-        on_dipoles = 5.0 * n[:, :, None] * along[:, None, :] - 2.0 * turned.transpose(0, 2, 1)
+        on_dipoles = 5.0 * n[:, :, None] * along[:, None, :] - 2.0 * projected.transpose(0, 2, 1)
         block[:, 1:4, 4:] = on_dipoles / d**4
         block[:, 4:, 1:4] = -on_dipoles.transpose(0, 2, 1) / d**4
         among = 2.0 * np.einsum("akl,bkl->ab", _BASIS, _BASIS)[None] + 35.0 * along[:, :, None] * along[:, None, :]
-        block[:, 4:, 4:] = (among - 20.0 * np.einsum("pak,pbk->pab", turned, turned)) / (3.0 * d**5)
+        block[:, 4:, 4:] = (among - 20.0 * np.einsum("pak,pbk->pab", projected, projected)) / (3.0 * d**5)
         block[:, 4:, 1:] *= self.quadrupole[0][:, None, None]
         block[:, 1:4, 4:] *= self.quadrupole[0][:, None, None]
         matrix[self.i, :, self.j, :] = block
@@ -229,17 +219,17 @@ class NearContacts:
         n = self.count
         matrix = np.zeros((n, 9, n, 9))
         for side, ball, other, sign in ((0, self.i, self.j, 1), (1, self.j, self.i, -1)):
-            own, others = self._axes(ball, sign), self._axes(other, -sign)
+            axes_i, axes_j = self._axes(ball, sign), self._axes(other, -sign)
             a, b, c, d, e, f, g, h, i, j, k, l, o, p = self.value[side].T  # noqa: E741
             _, _, _, d_j, _, _, _, _, _, j_j, _, l_j, _, _ = self.value[1 - side].T
             among = np.array([[a, c, i], [c, e, k], [i, k, o]])
             cross = np.array([[b, d, j], [d_j, f, l], [j_j, l_j, p]])
             across = np.eye(3) - self.direction[:, :, None] * self.direction[:, None, :]
             across = across * self.radii[ball, None, None]
-            block = np.einsum("uvp,pua,pvb->pab", among, own, own)
+            block = np.einsum("uvp,pua,pvb->pab", among, axes_i, axes_i)
             block[:, 1:4, 1:4] += (g * self.radii[ball])[:, None, None] * across
             np.add.at(matrix, (ball, slice(None), ball), block)
-            block = np.einsum("uvp,pua,pvb->pab", cross, own, others)
+            block = np.einsum("uvp,pua,pvb->pab", cross, axes_i, axes_j)
             block[:, 1:4, 1:4] += (h * self.radii[other])[:, None, None] * across
             matrix[ball, :, other, :] = block
         return matrix.reshape(9 * n, 9 * n)
@@ -289,9 +279,9 @@ class NearContacts:
         unit = self.direction
         radial, turn = 0.0, 0.0
         for side, ball, other, sign in ((0, self.i, self.j, 1.0), (1, self.j, self.i, -1.0)):
-            own, others = self._at_contact(drive, ball, sign), self._at_contact(drive, other, -sign)
-            phi, alpha, gamma, field, pull, square = own
-            phi_j, alpha_j, gamma_j, field_j, _, _ = others
+            first, second = self._at_contact(drive, ball, sign), self._at_contact(drive, other, -sign)
+            phi, alpha, gamma, field, pull, square = first
+            phi_j, alpha_j, gamma_j, field_j, _, _ = second
             # terms of both balls count half for each
             mixed = np.sum(field * field_j, 1) + alpha * alpha_j
             energy = [0.5 * phi**2, 0.5 * phi * phi_j, phi * alpha, phi * alpha_j]
@@ -346,8 +336,8 @@ class NearContacts:
         for m, t, v, s, sign in ((m_i, t_j, v_j, s_j, 1.0), (m_j, t_i, v_i, s_i, -1.0)):
             along = dot(m, n)
             energy_4 += sign * (5.0 * along * s - 2.0 * dot(m, v))
-            turned = np.einsum("pkl,pl->pk", t, m)
-            turn_4 += sign * (5.0 * s[:, None] * m + 10.0 * along[:, None] * v - 2.0 * turned)
+            projected = np.einsum("pkl,pl->pk", t, m)
+            turn_4 += sign * (5.0 * s[:, None] * m + 10.0 * along[:, None] * v - 2.0 * projected)
         energy_5 = (2.0 * np.sum(t_i * t_j, axis=(1, 2)) - 20.0 * dot(v_i, v_j) + 35.0 * s_i * s_j) / 3.0
         turn_5 = -20.0 * (np.einsum("pkl,pl->pk", t_i, v_j) + np.einsum("pkl,pl->pk", t_j, v_i))
         turn_5 = (turn_5 + 70.0 * (s_j[:, None] * v_i + s_i[:, None] * v_j)) / 3.0

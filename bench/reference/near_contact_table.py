@@ -19,9 +19,7 @@ from bench.reference.spheres import sufficient_order
 from warpmag.kernels.near_contact.contact_table import FUNCTIONS, HARDNESSES, LOG_GAPS, TABLE_FILE
 
 
-def reduced_resistance(
-    distance: float, permeabilities, m: int, highest: int, order: int, source_quadrupole=1.0
-) -> np.ndarray:
+def reduced_resistance(distance, permeabilities, m: int, highest: int, order: int, source_quadrupole=1.0) -> np.ndarray:
     """K of order m of two balls of unit radius: computed up to degree ``order``, reduced to degrees up to ``highest``.
 
     For m = 0 a ball has a source; its coupling to the other's quadrupole is scaled by ``source_quadrupole``.
@@ -53,21 +51,17 @@ def pair_conductance(distance: float, permeabilities, tolerance: float = 1e-7) -
     axial[:2, :2] = [[u, -g1 * distance], [g1 * distance, -g1 - g2 * distance**2]]
     order = sufficient_order(distance, 1.0, 1.0, tolerance)
     parts = []
-    for m, highest, coupling, own in (
+    for m, highest, coupling, diagonal in (
         (0, 2, axial, np.diag([self_source, self_dipole, 0.0])),
         (1, 1, np.array([[-g1]]), np.array([[self_dipole]])),
     ):
-        far = np.block([[own, coupling.T], [coupling, own]])
+        far = np.block([[diagonal, coupling.T], [coupling, diagonal]])
         exact = reduced_resistance(distance, permeabilities, m, highest, order)
         plain = reduced_resistance(distance, permeabilities, m, highest, 2, short_range)
         parts.append(np.linalg.inv(exact - far) - np.linalg.inv(plain - far))
     x, y = parts
-    return np.array(
-        [
-            *(x[0, 0], x[0, 3], x[0, 1], -x[0, 4], x[1, 1], -x[1, 4], y[0, 0], y[0, 1]),
-            *(x[0, 2], x[0, 5], x[1, 2], x[1, 5], x[2, 2], x[2, 5]),
-        ]
-    )
+    dipoles = (x[0, 0], x[0, 3], x[0, 1], -x[0, 4], x[1, 1], -x[1, 4], y[0, 0], y[0, 1])
+    return np.array([*dipoles, x[0, 2], x[0, 5], x[1, 2], x[1, 5], x[2, 2], x[2, 5]])
 
 
 def spline_coefficients(values: np.ndarray) -> np.ndarray:
@@ -84,14 +78,11 @@ def spline_coefficients(values: np.ndarray) -> np.ndarray:
 def make_table() -> np.ndarray:
     """The table, shape [gap nodes + 2, hardness nodes + 2, hardness nodes + 2, FUNCTIONS]."""
     gaps = np.exp(np.linspace(*LOG_GAPS))
-    permeabilities = [math.inf if y == 0.0 else y**-2.0 for y in np.linspace(*HARDNESSES)]
+    # a ball of μr = 1 has no higher multipoles
+    permeabilities = [1e12 if y == 0.0 else min(max(y**-2.0, 1.0 + 1e-9), 1e12) for y in np.linspace(*HARDNESSES)]
     values = np.zeros((len(gaps), len(permeabilities), len(permeabilities), FUNCTIONS))
-    for i, gap in enumerate(gaps):
-        for j, own in enumerate(permeabilities):
-            for k, other in enumerate(permeabilities):
-                # a ball of μr = 1 has no higher multipoles
-                finite = [min(max(mu, 1.0 + 1e-9), 1e12) for mu in (own, other)]
-                values[i, j, k] = pair_conductance(2.0 + gap, finite)
+    for i, j, k in np.ndindex(values.shape[:3]):
+        values[i, j, k] = pair_conductance(2.0 + gaps[i], (permeabilities[j], permeabilities[k]))
     for axis in (0, 1, 2):
         values = np.moveaxis(spline_coefficients(np.moveaxis(values, axis, 0)), 0, axis)
     return values.astype(np.float32)

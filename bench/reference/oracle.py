@@ -309,8 +309,8 @@ def flux_rates(positions, moments, radii, velocities, spins, derivatives, field=
     """
 
     def h(seconds):
-        there, turned = positions + seconds * velocities, moments + seconds * np.cross(spins, moments)
-        return h_field(there, turned, radii=radii) + (0.0 if field is None else field(there))
+        moved, rotated = positions + seconds * velocities, moments + seconds * np.cross(spins, moments)
+        return h_field(moved, rotated, radii=radii) + (0.0 if field is None else field(moved))
 
     rates = (h(time) - h(-time)) / (2.0 * time) - np.cross(spins, h(0.0))
     return MU0 * (rates + 2.0 / 3.0 * np.einsum("nij,nj->ni", derivatives, rates))

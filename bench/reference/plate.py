@@ -10,8 +10,11 @@ rectangles along each side, and the error of a warpmag model.
 
 import itertools
 
+import newton
 import numpy as np
+import warp as wp
 
+import warpmag
 from bench.reference.oracle import MU0, relative
 from bench.reference.surface_integrals import potentials, rectangles_of, solved_charges
 
@@ -20,26 +23,24 @@ PLATE = (0.04, 0.04, 0.005)  # sides of the plate [m]
 GAPS = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01)  # gaps between plate and magnet [m]
 
 
-def force(gap: float, aside: float = 0.0, rectangles: int = 16) -> tuple[np.ndarray, np.ndarray]:
-    """Force [N] on the plate and its moment [A·m²], shape [3] each; the magnet is above it.
+def force(gap: float, offset: float = 0.0, rectangles: int = 16) -> tuple[np.ndarray, np.ndarray]:
+    """Force [N] on the plate and its moment [A·m²], shape [3] each.
 
-    Args:
-        gap: Gap between the faces [m].
-        aside: Offset of the magnet from the middle of the plate along x [m].
-        rectangles: Number of rectangles along each side of the plate.
+    The magnet is above the plate at a ``gap`` [m] and shifted by ``offset`` along x [m]. Each side of the plate has
+    the given number of rectangles.
     """
-    magnet = np.array([aside, 0.0, 0.5 * PLATE[2] + gap + 0.5 * MAGNET])
+    magnet = np.array([offset, 0.0, 0.5 * PLATE[2] + gap + 0.5 * MAGNET])
     lower, upper, axis = _rectangles(0.5 * np.asarray(PLATE, float), magnet, rectangles)
-    middle, size = 0.5 * (lower + upper), upper - lower
-    charge = solved_charges(lower, upper, axis, -_potential(middle, magnet)[:, None])[1][:, 0]
-    step, field = 1e-4 * MAGNET, np.zeros_like(middle)
+    center, size = 0.5 * (lower + upper), upper - lower
+    charge = solved_charges(lower, upper, axis, -_potential(center, magnet)[:, None])[1][:, 0]
+    step, field = 1e-4 * MAGNET, np.zeros_like(center)
     nodes, weights = np.polynomial.legendre.leggauss(3)
     for i, j, k in np.ndindex(3, 3, 3):
-        at = middle + 0.5 * size * nodes[[i, j, k]]
+        points = center + 0.5 * size * nodes[[i, j, k]]
         for n, d in enumerate(step * np.eye(3)):
-            change = _potential(at - d, magnet) - _potential(at + d, magnet)
+            change = _potential(points - d, magnet) - _potential(points + d, magnet)
             field[:, n] += weights[[i, j, k]].prod() / 8.0 * change / (2.0 * step)
-    return MU0 * charge @ field, charge @ middle
+    return MU0 * charge @ field, charge @ center
 
 
 def _potential(points, magnet) -> np.ndarray:
@@ -56,26 +57,21 @@ def _rectangles(half, magnet, count: int):
         inner = magnet[k] + 0.5 * MAGNET * np.array([-1.0, 1.0]) if k < 2 else []
         stops = np.unique(np.clip(np.concatenate([[-half[k]], inner, [half[k]]]), -half[k], half[k]))
         parts = max(2, round(count / (len(stops) - 1 if k < 2 else 2)))
-        at = 0.5 - 0.5 * np.cos(np.pi * np.linspace(0.0, 1.0, parts + 1))
-        edges.append(np.unique(np.concatenate([a + (b - a) * at for a, b in itertools.pairwise(stops)])))
+        fractions = 0.5 - 0.5 * np.cos(np.pi * np.linspace(0.0, 1.0, parts + 1))
+        edges.append(np.unique(np.concatenate([a + (b - a) * fractions for a, b in itertools.pairwise(stops)])))
     faces = [rectangles_of(edges, axis, end) for axis in range(3) for end in (-half[axis], half[axis])]
     return tuple(np.concatenate(arrays) for arrays in zip(*faces, strict=True))
 
 
-def model_forces(gap: float, aside: float, device="cpu") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def model_forces(gap: float, offset: float, device="cpu") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Force on the plate, its moment, and force on the magnet, of a Newton model with warpmag's magnets."""
-    import newton  # noqa: PLC0415 - the reference itself needs NumPy alone
-    import warp as wp  # noqa: PLC0415
-
-    import warpmag  # noqa: PLC0415
-
     builder, side = newton.ModelBuilder(), 0.5 * MAGNET
     warpmag.register_attributes(builder)
     iron = builder.add_body()
     builder.add_shape_box(iron, hx=0.5 * PLATE[0], hy=0.5 * PLATE[1], hz=0.5 * PLATE[2])
     warpmag.add_inducible(builder, iron, saturation=1e12)
-    place = (aside, 0.0, 0.5 * PLATE[2] + gap + side)
-    magnet = builder.add_body(xform=wp.transform(place, wp.quat_identity()))
+    center = (offset, 0.0, 0.5 * PLATE[2] + gap + side)
+    magnet = builder.add_body(xform=wp.transform(center, wp.quat_identity()))
     builder.add_shape_box(magnet, hx=side, hy=side, hz=side)
     warpmag.add_permanent(builder, magnet, magnetization=(0.0, 0.0, MAGNETIZATION))
     model = builder.finalize(device=device)
@@ -87,11 +83,11 @@ def model_forces(gap: float, aside: float, device="cpu") -> tuple[np.ndarray, np
 
 def main() -> None:
     """Print force and moment for all gaps."""
-    for gap, aside in itertools.product(GAPS, (0.0, 0.01)):
-        (coarse, _), (fine, moment) = force(gap, aside, 9), force(gap, aside, 18)
+    for gap, offset in itertools.product(GAPS, (0.0, 0.01)):
+        (coarse, _), (fine, moment) = force(gap, offset, 9), force(gap, offset, 18)
         change = np.abs(fine - coarse).max().round(4)
-        print(gap, aside, "N", fine.round(4), "A·m²", moment.round(4), "change", change, flush=True)
-        pull, magnetized, reaction = model_forces(gap, aside)
+        print(gap, offset, "N", fine.round(4), "A·m²", moment.round(4), "change", change, flush=True)
+        pull, magnetized, reaction = model_forces(gap, offset)
         errors = [relative(pull, fine), relative(magnetized, moment)]
         rest = np.linalg.norm(pull + reaction) / np.linalg.norm(pull)
         print(f"  model: force {100 * errors[0]:.2f} %, moment {100 * errors[1]:.2f} %; sum of forces {rest:.0e}")

@@ -240,11 +240,11 @@ class _Degrees:
         mirror = index - 2 * self.m
         sign = (-1.0) ** np.abs(self.m)
         # columns: cosine harmonics where m > 0, sine harmonics where m < 0
-        own = np.where(self.m > 0, sign / math.sqrt(2.0), np.where(self.m < 0, 1j / math.sqrt(2.0), 1.0))
-        other = np.where(self.m > 0, 1.0 / math.sqrt(2.0), -1j * sign / math.sqrt(2.0))
+        diagonal = np.where(self.m > 0, sign / math.sqrt(2.0), np.where(self.m < 0, 1j / math.sqrt(2.0), 1.0))
+        mirrored = np.where(self.m > 0, 1.0 / math.sqrt(2.0), -1j * sign / math.sqrt(2.0))
         paired = self.m != 0
-        places = np.concatenate([index, mirror[paired]]), np.concatenate([index, index[paired]])
-        self.real = csr_array((np.concatenate([own, other[paired]]), places), shape=(size, size))
+        positions = np.concatenate([index, mirror[paired]]), np.concatenate([index, index[paired]])
+        self.real = csr_array((np.concatenate([diagonal, mirrored[paired]]), positions), shape=(size, size))
 
     def translation(self, t, ladder=((0, 0, 1.0),)):
         """Matrix T from irregular real harmonics at a source to regular ones at a target, t = x_target − x_source.

@@ -100,8 +100,8 @@ def _box(sides, susceptibilities, count: int) -> np.ndarray:
 def _divided(face, count: int):
     """Corners of rectangles that shrink towards the edges of a face, and the axis of its normal."""
     axis = int(np.ptp(face, axis=0).argmin())
-    at = 0.5 - 0.5 * np.cos(np.pi * np.linspace(0.0, 1.0, count + 1))
-    return rectangles_of((face[0] + np.outer(at, face[1] - face[0])).T, axis, face[0][axis])
+    fractions = 0.5 - 0.5 * np.cos(np.pi * np.linspace(0.0, 1.0, count + 1))
+    return rectangles_of((face[0] + np.outer(fractions, face[1] - face[0])).T, axis, face[0][axis])
 
 
 def _areas(lower, upper, axis) -> np.ndarray:
@@ -150,19 +150,20 @@ def _cylinder(length: float, susceptibilities, count: int) -> np.ndarray:
     """Result of :func:`cylinder_moments` for ``count`` rings on half of the side and as many on a cap."""
     # w is constant around a ring for a field along the axis, and varies as the cosine of the azimuth for one across it
     radius, half = 0.5, 0.5 * length
-    at = np.sin(0.5 * np.pi * np.linspace(0.0, 1.0, count + 1))
-    side, cap = np.stack([np.full(count + 1, radius), half * at]), np.stack([radius * at, np.full(count + 1, half)])
+    fractions = np.sin(0.5 * np.pi * np.linspace(0.0, 1.0, count + 1))
+    side = np.stack([np.full(count + 1, radius), half * fractions])
+    cap = np.stack([radius * fractions, np.full(count + 1, half)])
     lower, upper = (np.concatenate([side.T[part], cap.T[part]]) for part in (slice(None, -1), slice(1, None)))
-    middle, width = 0.5 * (lower + upper), np.linalg.norm(upper - lower, axis=1)
+    center, width = 0.5 * (lower + upper), np.linalg.norm(upper - lower, axis=1)
     normals = np.repeat(np.eye(2), count, axis=0)
     moments = np.empty((len(susceptibilities), 2))
-    for mode, sign, values in ((0, -1.0, middle[:, 1]), (1, 1.0, middle[:, 0])):
-        angles = _ring_angles(middle, lower, upper, normals, mode)
-        angles += sign * _ring_angles(middle * [1, -1], lower, upper, normals, mode)
+    for mode, sign, values in ((0, -1.0, center[:, 1]), (1, 1.0, center[:, 0])):
+        angles = _ring_angles(center, lower, upper, normals, mode)
+        angles += sign * _ring_angles(center * [1, -1], lower, upper, normals, mode)
         part = slice(count, None) if mode == 0 else slice(None, count)  # caps, or the side
         around = 2.0 * np.pi if mode == 0 else np.pi
         for k, w in enumerate(_solved(angles, values, susceptibilities)):
-            moments[k, mode] = 2.0 * around * (w * middle[:, 0] * width)[part].sum() / (0.25 * np.pi * length)
+            moments[k, mode] = 2.0 * around * (w * center[:, 0] * width)[part].sum() / (0.25 * np.pi * length)
     return moments
 
 

@@ -27,17 +27,8 @@ def check_name(output: Path) -> None:
 def write(output: Path, pictures: Iterable[np.ndarray], frames: list[int], rate: float) -> list[Path]:
     """Write one file for a film, else one for each picture; names of several contain the numbers of the frames.
 
-    Args:
-        output: ``.png``, ``.mp4`` or ``.gif``.
-        pictures: 8-bit sRGB, each of shape [height, width, 3]; an iterator may make them one by one.
-        frames: Numbers of the frames.
-        rate: Pictures per second [Hz] of a film.
-
-    Returns:
-        The files written.
-
-    Raises:
-        InputError: A file cannot be written.
+    Pictures are 8-bit sRGB, shape [height, width, 3]; an iterator may make them one by one. The rate of a film is in
+    pictures per second [Hz]. Returns the files; raises :class:`InputError` if one cannot be written.
     """
     try:
         output.parent.mkdir(parents=True, exist_ok=True)

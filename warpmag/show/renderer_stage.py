@@ -65,36 +65,26 @@ class DrawnShape:
 
 
 class RendererStage:
-    """Builds the stage; :meth:`save` writes it.
+    """Builds the stage from its ``recording`` and the ``shapes`` of bodies and magnets; :meth:`save` writes it.
 
-    Attributes:
-        recording: Motion and moments of the stage.
-        shapes: Shapes of the bodies and magnets, invisible ones included.
+    Methods raise :class:`InputError` if the file is not a stage, a magnet has no shape, or a file cannot be written.
     """
 
     def __init__(self, path: str | os.PathLike, *, rate: float):
-        """Read a scene, or the recording of a run.
-
-        Args:
-            path: USD file.
-            rate: Time codes and frames per second.
-
-        Raises:
-            InputError: The file is not a stage.
-        """
-        source, swarms = open_animated(path)
+        """Read a scene, or the recording of a run, for ``rate`` time codes and frames per second."""
+        source, instancers = open_animated(path)
         self._files = {Path(layer.realPath).resolve() for layer in source.GetUsedLayers() if layer.realPath}
-        self.recording = read_recording(source, swarms)
+        self.recording = read_recording(source, instancers)
         self._codes = self.recording.codes * (rate / source.GetTimeCodesPerSecond())
-        self._stage = stage = Usd.Stage.Open(_scene_of(source, swarms, rate))
+        self._stage = stage = Usd.Stage.Open(_scene_of(source, instancers, rate))
         stage.SetStartTimeCode(float(np.floor(self._codes[0] + 1e-6)))
         # the last frame is at the step nearest to it, which may be slightly later
         stage.SetEndTimeCode(float(np.ceil(self._codes[-1] - 0.05)))
         self._scene = Sdf.Layer.CreateAnonymous(".usda")
         self._scene.TransferContent(stage.GetRootLayer())
         self.shapes = self._find_shapes()
-        for swarm in swarms:
-            self.shapes = swarm.with_copies(self.shapes, self.recording.bodies)
+        for instancer in instancers:
+            self.shapes = instancer.with_copies(self.shapes, self.recording.bodies)
         instanced = self._instanced()
         self._moving = [shape for shape in self.shapes if shape.drawn and shape.row >= 0 and instanced[shape.row]]
         self._root = self._make_root()
@@ -160,11 +150,7 @@ class RendererStage:
         author_mesh(UsdGeom.Mesh.Define(self._stage, shape.path), points, faces)
 
     def shapes_of_magnets(self) -> list[list[DrawnShape]]:
-        """Return the visible shapes of each magnet of the recording, or all shapes if none is visible.
-
-        Raises:
-            InputError: A magnet has no shape.
-        """
+        """Return the visible shapes of each magnet of the recording, or all shapes if none is visible."""
         magnets: dict[str, list[DrawnShape]] = {path: [] for path in self.recording.magnets}
         for shape in self.shapes:
             path = shape.path
@@ -178,11 +164,7 @@ class RendererStage:
         return [[shape for shape in shapes if shape.drawn] or shapes for shapes in magnets.values()]
 
     def add_bodies(self, shades: np.ndarray | None = None) -> None:
-        """Add the bodies.
-
-        Args:
-            shades: Position of each body's color on the scale, 0 to 1, shape [f, n]; None keeps their own materials.
-        """
+        """Add the bodies, with their own materials or in shades of the color scale, 0 to 1, shape [f, n]."""
         materials = self._author_scale() if shades is not None else None
         record = self.recording
         for name in ("Balls", "Bodies"):
@@ -273,11 +255,7 @@ class RendererStage:
         UsdGeom.Gprim(prim).CreateDisplayColorAttr(Vt.Vec3fArray([Gf.Vec3f(*color)]))
 
     def save(self, output: str | os.PathLike, *, materialx: bool = False) -> None:
-        """Write the stage to a ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file, or as a web page, ``.html``.
-
-        Raises:
-            InputError: The file cannot be written.
-        """
+        """Write the stage to a ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file, or as a web page, ``.html``."""
         path = usable_path(output)
         if path.suffix not in _SUFFIXES:
             raise InputError(f"{path}: a stage must end in {', '.join(_SUFFIXES)}, numbers in .npz or .csv")
@@ -304,9 +282,9 @@ class RendererStage:
             known.Reload(force=True)
 
 
-def _scene_of(source: Usd.Stage, swarms: Sequence[BallInstancer], rate: float) -> Sdf.Layer:
+def _scene_of(source: Usd.Stage, instancers: Sequence[BallInstancer], rate: float) -> Sdf.Layer:
     """Return the scene without the layers of runs, as one layer with ``rate`` time codes per second."""
-    # the layer has a prim for each instance, as in the run; of ``swarms`` only for balls that differ from all others
+    # the layer has a prim for each instance, as in the run; of ``instancers`` only for balls that differ from the rest
     root = source.GetRootLayer()
     top = Sdf.Layer.CreateAnonymous(".usda")
     for key in copied_metadata(root):
@@ -317,7 +295,7 @@ def _scene_of(source: Usd.Stage, swarms: Sequence[BallInstancer], rate: float) -
     for layer in stage.GetUsedLayers():
         if "warpmag" in layer.customLayerData:
             stage.MuteLayer(layer.identifier)
-    kept = {swarm.path for swarm in swarms}
+    kept = {instancer.path for instancer in instancers}
     instances = expand_instancers(stage, stage.GetStartTimeCode(), defer=True)
     complete_instances([instance for instance in instances if str(instance.instancer) not in kept])
     with Usd.EditContext(stage, stage.GetSessionLayer()):
