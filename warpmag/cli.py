@@ -14,7 +14,7 @@ from warpmag.engine.pile_xpbd.solvers import SOLVERS
 from warpmag.errors import InputError, SimulationError, one_line
 from warpmag.moments.ranks import Ranks, current_ranks, is_first_rank, on_first_rank, without_ranks
 from warpmag.progress import Progress
-from warpmag.terminal import Stopped, collection_paused, open_standard_files, quiet_warp, signals_raised, silence, tell
+from warpmag.terminal import Stopped, collection_paused, log, open_standard_files, quiet_warp, signals_raised, silence
 
 BAD_INPUT, FAILED, STOPPED = 2, 1, 128
 """Exit codes. 0 is success. A command ended by a signal exits with ``STOPPED`` plus the signal's number."""
@@ -53,13 +53,13 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         all_ranks = current_ranks()
     except InputError as error:
-        tell(error)
+        log(error)
         return BAD_INPUT
     code, line = _execute(arguments, all_ranks)
     if line and all_ranks is not None:
-        all_ranks.fail(line, code, tell)
+        all_ranks.fail(line, code, log)
     elif line:
-        tell(line)
+        log(line)
     return code
 
 
@@ -196,7 +196,7 @@ def _find_scene(name: str, balls: int | None = None, folder: Path = _OUTPUT_FOLD
             return scenes[name], True
         generated = on_first_rank(lambda: make(name, folder, balls), current_ranks())
         if is_first_rank(current_ranks()):
-            tell(f"scene: {generated}")
+            log(f"scene: {generated}")
         return generated, False
     if not os.path.exists(path) and not path.suffix:
         raise InputError(f"{name}: no such file and no bundled scene (bundled: {', '.join((*scenes, *MADE))})")
@@ -366,13 +366,13 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
     if simulation.capture_failure:
         _warn([f"steps were launched kernel by kernel, which is slower: {simulation.capture_failure}"])
     if display is not None and options.viewer in _BROWSER_VIEWERS and display.viewer.is_running():
-        tell(f"the {options.viewer} viewer shows the last frame until Ctrl-C")
+        log(f"the {options.viewer} viewer shows the last frame until Ctrl-C")
         display.stay()
 
 
 def _warn(lines: list[str]) -> None:
     for line in lines if is_first_rank(current_ranks()) else ():
-        tell(f"warning: {line}")
+        log(f"warning: {line}")
 
 
 def _open_display(name: str, simulation):

@@ -57,7 +57,7 @@ def silence(descriptor: int) -> None:
     os.close(null)
 
 
-def tell(message) -> None:
+def log(message) -> None:
     """Print a line on stderr. A closed stderr raises no error."""
     try:
         print(f"warpmag: {message}", file=sys.stderr, flush=True)

@@ -50,17 +50,17 @@ def run_trials(trials: Sequence[Trial], workers: int = 1) -> Iterator[tuple[Tria
     if trials and trials[0].device == "cpu":
         workers = max(1, len(cores) // _CORES)
     context = multiprocessing.get_context("spawn")
-    shares = context.Queue()
+    queue = context.Queue()
     for worker in range(workers):
-        shares.put(cores[_CORES * worker : _CORES * (worker + 1)] if trials[0].device == "cpu" else cores)
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_pin, initargs=(shares,)) as pool:
+        queue.put(cores[_CORES * worker : _CORES * (worker + 1)] if trials[0].device == "cpu" else cores)
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_pin, initargs=(queue,)) as pool:
         yield from zip(trials, pool.map(run_trial, trials), strict=True)
 
 
-def _pin(shares) -> None:
-    share = shares.get()
-    if share:
-        os.sched_setaffinity(0, share)
+def _pin(queue) -> None:
+    """Pin this process to the next cores of the queue."""
+    if cores := queue.get():
+        os.sched_setaffinity(0, cores)
 
 
 def run_trial(trial: Trial) -> dict:

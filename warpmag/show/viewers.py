@@ -19,7 +19,7 @@ _COLORS = np.array([(0.27, 0.0, 0.33), (0.13, 0.57, 0.55), (0.99, 0.91, 0.14)])
 _LENGTH = 1.6
 """Half the longest arrow over the radius of its shape; both ends stick out of the shape."""
 _PAUSE = 1.0 / 60.0
-"""Time between two looks at the buttons of a viewer that is paused or has nothing new to show [s]."""
+"""Interval at which the buttons of a viewer are polled while it is paused or shows the last frame [s]."""
 
 
 def no_viewer(name: str, error: Exception) -> InputError:

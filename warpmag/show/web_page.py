@@ -106,8 +106,8 @@ def _instances(stage: Usd.Stage, codes: np.ndarray) -> Iterator[_Batch]:
         for number in range(len(groups)):
             points, faces = shapes[int(np.argmax(group == number))]
             members = group[prototypes[0]] == number
-            arrays = (array[:, members] for array in (positions, orientations, scales))
-            yield _Batch(points, faces, *arrays, palette, prototypes[:, members])
+            copies = positions[:, members], orientations[:, members], scales[:, members]
+            yield _Batch(points, faces, *copies, palette, prototypes[:, members])
 
 
 def _meshes(stage: Usd.Stage, codes: np.ndarray) -> Iterator[_Batch]:
