@@ -145,7 +145,7 @@ def run_case(case: Case, device, sizes, frames: int | None, scenes=()) -> None:
         write({"case": case.name, "scene": name, **run_bundled(name, device)})
     if scenes:
         return
-    whole = {
+    runs = {
         "worlds": run_worlds,
         "scene": run_scene,
         "writing": functools.partial(run_writing, frames=frames),
@@ -153,8 +153,8 @@ def run_case(case: Case, device, sizes, frames: int | None, scenes=()) -> None:
     }
     for dtype in case.dtypes:
         for count in sizes or case.sizes["cpu" if device.is_cpu else "cuda"]:
-            part = case.name in RUNNERS
-            result = run_system(case, count, dtype, device) if part else whole[case.name](count, device)
+            run = runs.get(case.name)
+            result = run(count, device) if run else run_system(case, count, dtype, device)
             write({"case": case.name, "dtype": dtype, "count": count, **result})
 
 

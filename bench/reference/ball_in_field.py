@@ -45,8 +45,8 @@ def dipole_charges(position, moment, distance: float):
 def dipole_pull(distance, radius: float, susceptibility: float, along: bool, order=400) -> float:
     """Attraction [N] of a ball by a unit moment [A·m²] at a ``distance`` from its center [m], summed over degrees.
 
-    The moment points to the ball if ``along``, else perpendicular to that. χ may be infinite; ``order`` is the highest
-    degree.
+    The moment points to the ball if ``along``, else it is perpendicular to this direction. χ may be infinite; ``order``
+    is the highest degree.
     """
     degree = np.arange(1, order + 1)
     weight = (degree + 1.0) ** 2 if along else 0.5 * degree * (degree + 1.0)

@@ -75,9 +75,9 @@ class Pair:
 
 
 def pair(distance, radii, permeabilities, *, order=None, tolerance=1e-10) -> Pair:
-    """Solve two balls of given ``distance`` of the centers [m], radii [m] and relative permeabilities μr > 1 (maybe ∞).
+    """Solve two balls from the distance of their centers [m], radii [m] and permeabilities μr > 1, finite or infinite.
 
-    None chooses the order of the expansions by ``tolerance``, the target of the relative truncation error.
+    If ``order`` is None, the order of the expansions follows from ``tolerance``, the relative truncation error.
     """
     unit = math.sqrt(radii[0] * radii[1])
     d, a, b = distance / unit, radii[0] / unit, radii[1] / unit
