@@ -42,9 +42,9 @@ _SOFT_BOXES = (
 
 
 def new_stage(documentation: str, *, seconds: float, frames_per_second: float = 60.0) -> Usd.Stage:
-    """Return an empty stage in meters and kilograms with Z up, the default prim ``/World`` and a length [s].
+    """Return an empty stage in meters and kilograms with Z up, the default prim ``/World`` and a duration [s].
 
-    ``warpmag scenes`` prints the first line of the ``documentation``. The output rate [Hz] is also that of time codes.
+    ``warpmag scenes`` prints the first line of the ``documentation``. Frames and time codes have the same rate [Hz].
     """
     stage = Usd.Stage.CreateInMemory()
     metadata = {"metersPerUnit": 1.0, "kilogramsPerUnit": 1.0, "upAxis": "Z", "documentation": documentation}
@@ -70,20 +70,16 @@ def save(stage: Usd.Stage, path: str | os.PathLike) -> None:
         stage.GetRootLayer().Export(str(path))
 
 
-def add_scene(
-    stage: Usd.Stage, settings: MagneticSettings, *, step: float = 1e-3, gravity: float = GRAVITY
-) -> Usd.Prim:
-    """Author the physics scene: time step [s], gravity [m/s²] towards -z and magnetic settings."""
+def add_scene(stage: Usd.Stage, settings: MagneticSettings, *, gravity: float = GRAVITY) -> None:
+    """Author the physics scene: a time step of 1 ms, gravity [m/s²] towards -z and magnetic settings."""
     scene = UsdPhysics.Scene.Define(stage, "/World/PhysicsScene")
     scene.CreateGravityDirectionAttr(Gf.Vec3f(0.0, 0.0, -1.0))
     scene.CreateGravityMagnitudeAttr(gravity)
     prim = scene.GetPrim()
     prim.AddAppliedSchema("NewtonSceneAPI")
-    prim.CreateAttribute("newton:timeStepsPerSecond", Sdf.ValueTypeNames.Int, False, Sdf.VariabilityUniform).Set(
-        round(1.0 / step)
-    )
+    rate = prim.CreateAttribute("newton:timeStepsPerSecond", Sdf.ValueTypeNames.Int, False, Sdf.VariabilityUniform)
+    rate.Set(1000)
     author_settings(prim, settings)
-    return prim
 
 
 def add_material(
@@ -100,7 +96,7 @@ def add_material(
     """Author a material for physics and rendering, ``/World/Materials/NAME``.
 
     The color is linear RGB; metalness, roughness and clear coat are 0 to 1. The density [kg/m³] is that of bodies with
-    this material. With static and dynamic friction, rolling and torsional friction are :data:`CONTACT_PATCH`, else 0.
+    this material. If ``friction`` is positive, rolling and torsional friction are :data:`CONTACT_PATCH`, else zero.
     """
     UsdGeom.Scope.Define(stage, "/World/Materials")
     material = UsdShade.Material.Define(stage, f"/World/Materials/{name}")
