@@ -94,15 +94,11 @@ def _with_balls(recording: Recording, instancer: BallInstancer) -> Recording:
     arrays = [instancer.arrays(Usd.TimeCode(code)) for code in recording.codes.tolist()]
     poses = np.stack([instancer.poses(frame) for frame in arrays])
     velocities = np.stack([instancer.velocities(frame) for frame in arrays])
-    balls = {
-        "positions": poses[..., :3],
-        "rotations": poses[..., 3:].astype(np.float32),
-        "linear": velocities[..., :3].astype(np.float32),
-        "angular": velocities[..., 3:].astype(np.float32),
-    }
-    fields: dict[str, Any] = {
-        name: np.concatenate([getattr(recording, name), values], axis=1) for name, values in balls.items()
-    }
+    balls = (poses[..., :3], poses[..., 3:], velocities[..., :3], velocities[..., 3:])
+    fields: dict[str, Any] = {}
+    for name, values in zip(("positions", "rotations", "linear", "angular"), balls, strict=True):
+        bodies = getattr(recording, name)
+        fields[name] = np.concatenate([bodies, values.astype(bodies.dtype)], axis=1)
     if len(arrays[0][MOMENTS_PRIMVAR]):
         rows = np.flatnonzero([magnet is not None for magnet in instancer.magnets])
         moments = np.stack([frame[MOMENTS_PRIMVAR][rows] for frame in arrays])
@@ -135,9 +131,8 @@ class _Poses:
         """Return positions, shape [f, 3], and quaternions, shape [f, 4]; poses that a run wrote are unchanged."""
         order = list(UsdGeom.Xformable(prim).GetXformOpOrderAttr().Get() or ())
         resets = order[:1] == ["!resetXformStack!"]
-        if order[resets:] not in ([TRANSLATE, ORIENT], [TRANSLATE, ORIENT, SCALE]) or not (
-            resets or _parents_are_still(prim)
-        ):
+        recorded = order[resets:] in ([TRANSLATE, ORIENT], [TRANSLATE, ORIENT, SCALE])
+        if not (recorded and (resets or _parents_are_still(prim))):
             return self._composed(prim)
         positions = _values(prim.GetAttribute(TRANSLATE), self._codes, Vt.Vec3dArray)
         rotations = _values(prim.GetAttribute(ORIENT), self._codes, Vt.QuatfArray)
