@@ -90,7 +90,7 @@ def check_count(name: str, value: Any) -> None:
 
 
 def joint_ends_apart(gap, distance):
-    """Return True if a gap [m] between the ends of a joint counts, at a ``distance`` [m] of one from the origin."""
+    """Return True if the gap [m] between the ends of a joint exceeds rounding at their distance [m] from the origin."""
     return gap > _JOINT_GAP + _JOINT_ROUNDING * distance
 
 

@@ -105,7 +105,7 @@ class KeyReader:
 def make_kinematic(
     stage: Usd.Stage, animated: Iterable[Sdf.Path], is_source: Callable[[Usd.Prim], bool] = lambda _: False
 ) -> None:
-    """Make animated colliders and field sources without a rigid body kinematic bodies, in the session layer.
+    """Turn animated colliders and field sources that have no rigid body into kinematic bodies, in the session layer.
 
     ``animated`` are prims whose own transforms have time samples. ``is_source`` returns True for coils and field maps.
     """

@@ -54,7 +54,7 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
 
 
 def open_deferred(path: str | os.PathLike, time_code: float | None = None) -> tuple[Usd.Stage, list[IdenticalBalls]]:
-    """Open a stage like :func:`open_stage`, but leave prims of identical balls to :func:`complete_instances`."""
+    """Open a stage like :func:`open_stage`; return it with the identical balls whose prims are not created yet."""
     file = _readable(path)
     if reason := trial_read(full_path(file)):
         raise InputError(f"{path}: {reason}")
@@ -159,7 +159,7 @@ def _value_at(attribute, time_code):
 
 
 def _block_addresses(stage: Usd.Stage) -> None:
-    """Block shader inputs with network addresses, from which Newton would fetch textures, in the session layer."""
+    """Block, in the session layer, shader inputs with network addresses: Newton would fetch textures from them."""
     addresses = []
     for prim in descendants(stage.GetPseudoRoot()):
         for attribute in prim.GetAuthoredPropertiesInNamespace("inputs"):

@@ -39,7 +39,7 @@ class Recording:
 
 
 def read_recording(stage: Usd.Stage, instancers: Sequence[BallInstancer] = ()) -> Recording:
-    """Read a stage that is not frozen at all time samples of its bodies and moments.
+    """Return bodies and moments of a stage, which must not be frozen, at all their time samples.
 
     The balls of ``instancers``, which have no prims, follow the bodies and magnets with prims.
     """

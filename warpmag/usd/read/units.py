@@ -125,7 +125,7 @@ def convert_units(stage: Usd.Stage) -> None:
 
 
 def _converted(prim: Usd.Prim, units: Units) -> Iterator[tuple[Usd.Attribute, object, list[tuple[float, object]]]]:
-    """Yield attributes of a prim, with their converted defaults and time samples; None for types without a unit."""
+    """Yield the attributes of a prim in other units than SI, with their converted defaults and time samples."""
     for name in prim.GetPropertyNames():
         attribute = prim.GetAttribute(name)
         if not attribute or not (attribute.HasAuthoredValue() or name in _SIZES):

@@ -88,7 +88,7 @@ class Output:
     # ---------------------------------------------------------------------------------------------------------------
 
     def lock(self) -> None:
-        """Lock the files for this run until :meth:`close`, or the end of the process."""
+        """Lock the files for this run; :meth:`close` or the end of the process unlocks them."""
         if self._lock >= 0:
             return
         path = self.root.with_name(f".{self.root.stem}.lock")

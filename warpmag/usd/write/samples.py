@@ -113,7 +113,7 @@ class SampleFile:
         return {name: np.asarray(value) for name, value in asdict(self._places).items()}
 
     def append(self, code: float, values: bytes, changed: np.ndarray) -> None:
-        """Append the values of all attributes at a time code greater than the last; after an error they are not there.
+        """Append a frame: the values of all attributes at a later time code. A frame that fails is not in the file.
 
         ``changed`` are attributes without samples whose value now differs from the first frame, shape [n].
         """
