@@ -135,9 +135,7 @@ class ColliderMagnet:
     """The magnet of one collider, for the shape that Newton makes of the collider."""
 
     magnet: Magnet  # magnetization in the frame of the prim that declares it
-    frames: tuple[
-        np.ndarray, ...
-    ]  # world matrices of that prim and the collider, for row vectors; empty if they are one
+    frames: tuple[np.ndarray, ...]  # world matrices of that prim and the collider, for row vectors; empty if equal
     axis: str | None  # token of the axis of a capsule, cylinder or cone, None for other shapes
 
 

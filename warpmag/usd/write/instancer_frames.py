@@ -28,7 +28,7 @@ class InstancerFrames:
     def values(
         self, body_q: np.ndarray, body_qd: np.ndarray, moments: np.ndarray, last_rotations: np.ndarray | None
     ) -> list[np.ndarray]:
-        """Return the values of ``columns`` in one frame, from moments [A·m²] and arguments of :meth:`Placements.place`."""
+        """Return the values of ``columns`` in one frame, from moments [A·m²] and poses as for :meth:`Placements.place`."""
         values = {name: np.empty((self._count, width), np.float32) for name, width in INSTANCE_ARRAYS.items()}
         values[MOMENTS_PRIMVAR] = moments
         box = np.array([[np.inf] * 3, [-np.inf] * 3])
