@@ -28,7 +28,7 @@ class InstancerFrames:
     def values(
         self, body_q: np.ndarray, body_qd: np.ndarray, moments: np.ndarray, last_rotations: np.ndarray | None
     ) -> list[np.ndarray]:
-        """Return the values of ``columns`` from poses, as in :meth:`Placements.place`, and moments [A·m²], shape [n, 3]."""
+        """Return the values of ``columns`` from poses, as in :meth:`Placements.place`, and moments [A·m²]."""
         values = {name: np.empty((self._count, width), np.float32) for name, width in INSTANCE_ARRAYS.items()}
         values[MOMENTS_PRIMVAR] = moments
         box = np.array([[np.inf] * 3, [-np.inf] * 3])
