@@ -303,7 +303,7 @@ def test_a_finished_picture_that_cannot_be_is_told_in_a_line(run, monkeypatch):
         ([run.with_name("a.gif")], "a finished picture must end in .png or .jpg"),
         ([run.with_name("a.png"), "--size", "0x9"], "width: must be at least 1"),
         ([run.with_name("a.png"), "--frames", "0:3"], "quality: 'final' draws one frame"),
-        ([run.with_name("a.png")], "WARPMAG_BLENDER: .*no_python is no Python that can be started"),
+        ([run.with_name("a.png")], "WARPMAG_BLENDER: .*no_python is not a Python that can be started"),
     ):
         with pytest.raises(InputError, match=message):
             options = cli._parser().parse_args([*command, *map(str, arguments)])

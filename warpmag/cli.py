@@ -37,7 +37,7 @@ class _Method(argparse.Action):
     """Store the summation method. ``--sums``, and presets as values of ``--method``, are deprecated spellings."""
 
     def __call__(self, parser, namespace, values, option_string=None):
-        """Store the value of the option, as a preset if it names one."""
+        """Store the value as the method, or as the preset if ``--method`` names a preset."""
         option = self.option_strings[0]
         name = "preset" if values in PRESETS and option == "--method" else "method"
         if name == "method":
@@ -128,7 +128,7 @@ def _add_run(commands) -> None:
     add("--dynamics", choices=DYNAMICS, help="magnetization dynamics (default: the stage's)")
     add("--contact-model", choices=CONTACT_MODELS, help="model of balls that nearly touch (default: the stage's)")
     names = f"{{{','.join(METHODS)}}}"
-    text = "sums by the faster method, over all pairs, or by the fast multipole method (default: %(default)s)"
+    text = "summation by the faster method, over all pairs, or by multipoles (default: %(default)s)"
     add("--method", action=_Method, default=METHODS[0], metavar=names, help=text)
     add("--sums", dest="method", action=_Method, default=METHODS[0], help=argparse.SUPPRESS)
     text = "relative magnetization error at which induction ends, at least 2e-6 (default: the stage's)"
@@ -223,9 +223,9 @@ def _check(options) -> int:
     sources = [source for group in contents.sources.values() for source in group]
     currents = sum(source.currents is not None for source in sources)
     if contents.motions or contents.magnetization_keys or contents.field_keys or currents:
-        fields = f", {currents} currents" if currents else ""
-        fields += ", the external field" if contents.field_keys else ""
-        print(f"keyed       {len(contents.motions)} bodies, {len(contents.magnetization_keys)} magnetizations{fields}")
+        more = f", {currents} currents" if currents else ""
+        more += ", the external field" if contents.field_keys else ""
+        print(f"keyed       {len(contents.motions)} bodies, {len(contents.magnetization_keys)} magnetizations{more}")
     if sources:
         types = [type(source.source).__name__ for source in sources]
         print(f"sources     {types.count('Coil')} coils, {types.count('FieldMap')} field maps")

@@ -37,10 +37,14 @@ def signals_raised() -> Iterator[None]:
     def stop(number, _):
         raise Stopped(number)
 
-    ending = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
+    defaults = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: signal.SIG_DFL,
+        signal.SIGHUP: signal.SIG_DFL,
+    }
     replaced = {}
     if threading.current_thread() is threading.main_thread():
-        replaced = {number: handler for number, handler in ending.items() if signal.getsignal(number) == handler}
+        replaced = {number: handler for number, handler in defaults.items() if signal.getsignal(number) == handler}
     for number in replaced:
         signal.signal(number, stop)
     try:
@@ -77,7 +81,7 @@ def quiet_warp() -> None:
 
 @contextlib.contextmanager
 def _without_lines(*texts: str) -> Iterator[None]:
-    """Remove lines with one of ``texts`` from the stderr of native code."""
+    """Suppress the lines of native code on stderr that contain one of ``texts``."""
     sys.stderr.flush()
     saved = os.dup(2)
     with tempfile.TemporaryFile() as caught:

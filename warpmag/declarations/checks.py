@@ -11,9 +11,9 @@ from typing import Any
 from warpmag.errors import InputError
 
 _JOINT_GAP, _JOINT_ROUNDING = 1e-4, 1e-5
-"""Largest gap [m] between the ends of a joint that count as coincident, plus a fraction of their coordinates.
+"""Gap [m] up to which the ends of a joint count as coincident, and a fraction of their distance from the origin.
 
-The fraction allows for poses in single precision.
+The gap grows by this fraction, because poses are in single precision.
 """
 
 _REPR = reprlib.Repr()

@@ -150,16 +150,16 @@ class MagnetizationCurve:
         t = np.minimum((x - h[k]) / span, 1.0)
         begin, end = span * d[k], span * d[k + 1]
         inside = m[k] + t * (begin + t * (3.0 * rise - 2.0 * begin - end + t * (begin + end - 2.0 * rise)))
-        rest = self.saturation - m[-1]  # of the magnetization, at the last point
-        rest_beyond = rest**2 / (rest + d[-1] * np.maximum(x - h[-1], 0.0)) if rest > 0.0 else 0.0
-        return np.where(x <= h[-1], inside, self.saturation - rest_beyond)
+        deficit = self.saturation - m[-1]  # Ms − M at the last point
+        deficit_beyond = deficit**2 / (deficit + d[-1] * np.maximum(x - h[-1], 0.0)) if deficit > 0.0 else 0.0
+        return np.where(x <= h[-1], inside, self.saturation - deficit_beyond)
 
 
 def _slopes(h, m):
     """Return the slopes dM/dH at the points, by PCHIP."""
     span, secant = np.diff(h), np.diff(m) / np.diff(h)
     slope = np.empty(len(h))
-    slope[0] = secant[0]  # of the curve joined to its mirror image
+    slope[0] = secant[0]  # the curve continues as its mirror image
     weight, other = 2.0 * span[1:] + span[:-1], span[1:] + 2.0 * span[:-1]
     rising = (secant[:-1] > 0.0) & (secant[1:] > 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -198,18 +198,18 @@ def _points(name: str, fields, quantity: str, values) -> tuple[np.ndarray, np.nd
 def _check_points(name: str, h, m) -> None:
     if h[0] == 0.0 and m[0] != 0.0:
         raise InputError(f"{name}: at H = 0 there is M = {m[0]:.4g} A/m; a curve without hysteresis begins at 0")
-    falls = np.flatnonzero(np.diff(h) <= 0.0)
-    if len(falls):
-        k = falls[0]
+    not_rising = np.flatnonzero(np.diff(h) <= 0.0)
+    if len(not_rising):
+        k = not_rising[0]
         raise InputError(f"{name}: H must rise from 0, but {h[k + 1]:g} A/m follows {h[k]:g} A/m")
-    strongest = float(MU0 * m.max())
-    if strongest > _LARGEST_POLARIZATION:
+    polarization = float(MU0 * m.max())
+    if polarization > _LARGEST_POLARIZATION:
         k = int(m.argmax())
         raise InputError(
-            f"{name}: at H = {h[k]:g} A/m the polarization B − μ0 H is {strongest:.3g} T, which no material reaches: "
-            "H is in A/m, B in T"
+            f"{name}: at H = {h[k]:g} A/m the polarization B − μ0 H is {polarization:.3g} T, which no material reaches"
+            ": H is in A/m, B in T"
         )
-    falls = np.flatnonzero(np.diff(m) < -_LEVEL_TOLERANCE * strongest / MU0)
+    falls = np.flatnonzero(np.diff(m) < -_LEVEL_TOLERANCE * polarization / MU0)
     if len(falls):
         k = falls[0]
         raise InputError(

@@ -39,10 +39,13 @@ SATURATION_OF_IRON = 1.7e6
 """Default saturation magnetization [A/m]."""
 
 
-def check_curve(name: str, value: Any, others: tuple[str, ...] = ()) -> None:
-    """Raise :class:`InputError` unless ``value`` is a measured curve or in :data:`CURVES`, listed with ``others``."""
+def check_curve(name: str, value: Any, materials: tuple[str, ...] = ()) -> None:
+    """Raise :class:`InputError` unless ``value`` is a measured curve or in :data:`CURVES`.
+
+    The message lists ``CURVES`` and the names of ``materials`` with a measured curve.
+    """
     if not isinstance(value, MagnetizationCurve) and not (isinstance(value, str) and value in CURVES):
-        check_token(name, value, (*CURVES, *others))
+        check_token(name, value, (*CURVES, *materials))
 
 
 def check_material(name: str, value: Any, *, infinite: bool = False) -> None:

@@ -127,15 +127,15 @@ def inducible(owner: str, name: str) -> dict:
 def inducible_from(material: str | None, curve, numbers: dict) -> dict:
     """Return the fields of an inducible ``Magnet`` from a material, a curve for :func:`measured`, and numbers.
 
-    ``numbers`` are the given ones of ``saturation`` [A/m] and ``susceptibility``. Two arguments that set the same field
-    raise :class:`InputError`.
+    ``numbers`` holds ``saturation`` [A/m] and ``susceptibility`` where the caller gives them. Two arguments that set
+    the same field raise :class:`InputError`.
     """
     values = numbers if curve is None else {**numbers, "curve": measured("curve", curve)}
     has_table = isinstance(values.get("curve"), MagnetizationCurve)
     from_material = {} if material is None else inducible("material", material)
     is_measured = has_table or "curve" in from_material
-    set_fields = ("saturation", "susceptibility", "curve") if is_measured else tuple(from_material)
-    conflicts = [name for name in values if name in set_fields and (material is not None or name != "curve")]
+    fields_set = ("saturation", "susceptibility", "curve") if is_measured else tuple(from_material)
+    conflicts = [name for name in values if name in fields_set and (material is not None or name != "curve")]
     if conflicts and (material is not None or has_table):
         owner = f"material: {short_repr(material)}" if material is not None else "curve: a measured curve"
         raise InputError(f"{owner} sets {' and '.join(conflicts)}, give one or the other")

@@ -9,7 +9,7 @@ def conjugate(quaternions) -> np.ndarray:
 
 
 def multiply(a, b) -> np.ndarray:
-    """Return quaternion products a b, shape [n, 4]: the rotation ``b``, followed by ``a``."""
+    """Return quaternion products a b, shape [n, 4]: rotation ``b`` first, then ``a``."""
     va, vb, wa, wb = a[:, :3], b[:, :3], a[:, 3:], b[:, 3:]
     return np.concatenate([wa * vb + wb * va + cross(va, vb), wa * wb - dot(va, vb)], axis=1)
 

@@ -20,7 +20,7 @@ AMPERE_TURNS = 2500.0
 STIFFNESS = 2000.0  # N/m, of the slide's drive
 START, END = (0.15, 0.1), (0.12, -0.12)  # m, positions where the ball is picked up and put down
 PAD, LIFT = 0.014, 0.03  # m, height of the pad above the ground, and of the lift
-TIMES = (0.0, 0.3, 0.5, 1.2, 1.4, 1.6)  # s: wait, picked up, lifted, turned, lowered, released
+TIMES = (0.0, 0.3, 0.5, 1.2, 1.4, 1.6)  # s: start, picked up, lifted, turned, lowered, released
 # MuJoCo's contacts are springs: with Newton's 2500 N/m the pulled ball sinks 0.9 mm into the pad, with this stiffness
 # a hundredth of that. Steps must not exceed 2/sqrt(ke), 4 ms.
 HARD = {"ke": 2.5e5, "kd": 1e3}

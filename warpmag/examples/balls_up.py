@@ -67,7 +67,7 @@ class Example:
         return float(mechanical + self.simulation.magnetics.energy()[0])
 
     def test_final(self):
-        """Check that energy falls and grows in no frame, balls do not overlap, and some hang at the magnet."""
+        """Check that energy falls and rises in no frame, balls do not overlap, and some hang at the magnet."""
         gained, lost = max(np.diff(self.energies)), self.energies[0] - self.energies[-1]
         assert lost > 0.0 and gained < 0.01 * lost, f"energy rose by {gained:g} J in a frame, of {lost:g} J lost"
         figures = self.simulation.finish()

@@ -1,7 +1,7 @@
 """Coils switched one after another lift steel balls out of a tray, carry them along, and drop them.
 
-Brass balls stay in place. A coil lifts a steel ball if its current exceeds a threshold, 1,180 ampere-turns here, with a
-closed form (see ``worlds``).
+Brass balls stay in place. A coil lifts a steel ball if its current exceeds a threshold, here 1,180 ampere-turns. The
+example ``worlds`` has a closed form of the threshold.
 """
 
 import newton
@@ -59,9 +59,9 @@ class Example:
 
     def step(self):
         """Advance by a frame of 20 ms."""
-        on = int(self.simulation.time / HOLD)
+        active = int(self.simulation.time / HOLD)
         for coil in range(self.coils):
-            self.simulation.magnetics.set_current(f"coil{coil}", AMPERE_TURNS if coil == on else 0.0)
+            self.simulation.magnetics.set_current(f"coil{coil}", AMPERE_TURNS if coil == active else 0.0)
         for _ in range(20):
             self.simulation.step()
 

@@ -73,7 +73,7 @@ class Example:
         self.display.show(self.simulation.time, self.simulation.state)
 
     def lifted(self) -> np.ndarray:
-        """Return true for each world whose ball hangs at the plate, shape [worlds]."""
+        """Return True for each world whose ball hangs at the plate, shape [worlds]."""
         return self.simulation.state.body_q.numpy()[:, 2] > 0.0085
 
     def test_final(self):
@@ -87,7 +87,7 @@ class Example:
         least = self.currents[self.lifted()].min(initial=math.inf)
         return (
             f"{self.lifted().sum()} of {len(self.currents)} balls jumped, from {least:.1f} ampere-turns on; "
-            f"the closed form says {lifting_current():.1f}"
+            f"the closed form is {lifting_current():.1f}"
         )
 
 

@@ -86,7 +86,7 @@ def resolve_dtype(dtype: str):
 
 
 def resolve_device(device):
-    """Return the Warp device of a name, a device or None, Warp's default.
+    """Return the Warp device of a name or a device; None means Warp's default.
 
     Under ``mpirun``, each rank on a host gets another GPU.
     """
@@ -164,7 +164,7 @@ def host_positive(name: str, value, count: int, dtype, *, infinite: bool = False
 
 
 def norm_squared(array) -> float:
-    """Return the sum of squares of a Warp array of vectors; infinite or NaN if a component is."""
+    """Return the sum of squares of a Warp array of vectors; infinite or NaN if a component is infinite or NaN."""
     total: Any = wp.utils.array_inner(array, array)
     return float(total)
 
@@ -180,7 +180,7 @@ def largest(array) -> float:
 
 
 def first_not_finite(array, count: int) -> int | None:
-    """Return the first of ``count`` rows that is not finite, or None. On a GPU a reduction tests all rows first."""
+    """Return the index of the first of ``count`` rows that is not finite, or None. On a GPU a reduction tests first."""
     if isinstance(array, wp.array):
         if not count or (array.device.is_cuda and math.isfinite(norm_squared(array[:count]))):
             return None
@@ -315,7 +315,7 @@ def take_snapshot(arrays: dict[str, wp.array]) -> dict[str, np.ndarray]:
 
 
 def restore_snapshot(arrays: dict[str, wp.array], saved: dict[str, np.ndarray]) -> None:
-    """Write the bytes that :func:`take_snapshot` returned back into the arrays, which must be of the same sizes."""
+    """Copy the bytes that :func:`take_snapshot` returned back into the arrays, which must have the same sizes."""
     for name, array in arrays.items():
         if array.size:
             memory, data = _memory(array), saved.get(name)

@@ -4,7 +4,7 @@
 
 * ``start_from`` sets the magnetizations of the next start,
 * ``start`` starts a solve in the applied field,
-* ``refine`` improves the moments by the field of their neighbors, before the whole field is summed,
+* ``refine`` improves the moments in the field of their neighbors, before the whole field is summed,
 * ``iterate`` checks convergence in the summed field and takes one step.
 
 ``persistent_arrays`` returns the arrays that one solve passes to the next. All dynamics work on the state of a solve
@@ -52,7 +52,7 @@ class ThetaFlow:
             launch.launch()
 
     def refine(self):
-        """Improve each moment by the field of its neighbors."""
+        """Improve each moment in the field of its neighbors."""
         for launch in self._launches.sweeps:
             launch.launch()
 

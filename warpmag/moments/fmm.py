@@ -31,7 +31,7 @@ _FIELD_SHARE = 0.3
 _SLACK = 1.001
 """Factor on the extent of a body, because rounding of poses may move moments apart."""
 _LARGE_SHARE = 0.1
-"""Smallest share of all pairs that the method ``fmm`` always sums by multipoles, even if direct sums are faster."""
+"""The method ``fmm`` sums by multipoles from this share of all pairs on, even if direct sums are faster."""
 _COSTS = {
     ("cpu", Quantity.FIELD): (2.8e7, 55.0),
     ("cpu", Quantity.WRENCH): (1.0e7, 30.0),
@@ -84,8 +84,8 @@ def check_fast(rtol: float):
 def is_fast(pairs: float, count: int, quantity: Quantity, rtol: float, device, launched: bool = False) -> bool:
     """Return True if the method reaches ``rtol`` and is faster than direct sums of ``FIELD`` or ``WRENCH``.
 
-    ``pairs`` counts pairs of a target and a moment, ``count`` moments and targets. On a GPU it matters whether Python
-    launches the kernels, ``launched``, or a graph.
+    ``pairs`` counts pairs of a target and a moment, ``count`` moments and targets. ``launched`` means that Python
+    launches the kernels on a GPU, which is slower than a graph.
     """
     if rtol < LEAST_RTOL:
         return False

@@ -34,7 +34,7 @@ from warpmag.moments.system import MomentSystem, SolverSettings
 _FIELD_RANGE = {wp.float32: (3e-19, 1e12), wp.float64: (1e-100, 1e100)}
 """Smallest and largest field, in units of the saturation, by Warp scalar type: its square and root stay accurate."""
 _PLAUSIBLE = {wp.float32: (1e-15, 1e15), wp.float64: (1e-100, 1e100)}
-"""Range of plausible values by Warp scalar type. If a result is not finite, the error names the arguments outside."""
+"""Range of plausible values by Warp scalar type. If a result is not finite, the error names arguments outside it."""
 
 
 @dataclass(frozen=True)

@@ -152,7 +152,7 @@ def _slope(susceptibility):
 
 
 def _curve_ids(curve, n: int) -> tuple[np.ndarray, list[MagnetizationCurve]]:
-    """Return the kernels' number of each moment's curve, shape [n], and the list of measured curves."""
+    """Return the number by which kernels select each moment's curve, shape [n], and the list of measured curves."""
     is_list = isinstance(curve, (tuple, list)) and len(curve) == n
     measured: dict[MagnetizationCurve, int] = {}
     numbers: dict[int, int] = {}  # by identity, because the moments of a body share a curve object

@@ -45,7 +45,7 @@ class PairSums:
 
     Attributes:
         moments: Packed moments.
-        targets: Packed targets; the same object as ``moments`` if these are the targets.
+        targets: Packed targets; the same object as ``moments`` if the moments are the targets.
         base: Field [A/m] at the targets, shape [targets]; 0 at first. ``FIELD`` adds it to the sums. In ``WRENCH`` it
             exerts torques.
         out: Field [A/m] or forces [N], shape [targets].

@@ -92,7 +92,7 @@ class FieldProbe:
         )  # fmt: skip
 
     def measure(self) -> None:
-        """Launch the computation of the fields at :attr:`points`, from the moments of the last solve."""
+        """Launch the computation of the fields of the last solve's moments at :attr:`points`."""
         system, targets = self._system, self._targets
         if targets.count == 0:
             return

@@ -35,7 +35,7 @@ from warpmag.errors import InputError, SimulationError, extra, one_line
 _COUNTS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE")
 """Environment variables of launchers with the number of processes."""
 _ABORT_DELAY = 5.0
-"""Time [s] that a failed rank waits for the others to fail, too, before it aborts them."""
+"""Time [s] that a failed rank waits for the others to fail as well, before it aborts them."""
 _ID_BYTES, _INT32, _SUM = 128, 2, 0
 """NCCL's size of a unique identifier [bytes], type ``ncclInt32`` and operation ``ncclSum`` (``nccl.h``)."""
 
@@ -119,9 +119,9 @@ def compare_arguments(function: Callable[_P, _R]) -> Callable[_P, _R]:
 def sweep(simulate: Callable[[range], _R], world_count: int, *, together: int) -> list[_R]:
     """Simulate many worlds in groups, which the ranks of ``mpirun`` share.
 
-    Each rank simulates its groups on its own. At the end all ranks receive all results. The groups do not depend on the
-    number of ranks. Worlds of one model may share their substeps and the form of their sums. The results
-    are bitwise those of a single process, on any device.
+    Each rank simulates its groups on its own. At the end all ranks receive all results. Worlds of one model may share
+    substeps and the form of their sums, so results may depend on the groups. The groups do not depend on the number of
+    ranks: results are bitwise those of a single process, on any device.
 
     Args:
         simulate: Function of the numbers of the worlds of a group. Its result is sent to all ranks and must be
@@ -200,14 +200,14 @@ class Ranks:
         host = self._all.Split_type(mpi.COMM_TYPE_SHARED)
         self.local_rank = host.rank
         self._failures, self._gpus = self._all.Dup(), None
-        self._show, sys.excepthook = sys.excepthook, self._fail_uncaught
+        self._excepthook, sys.excepthook = sys.excepthook, self._fail_uncaught
 
     def share(self, count: int) -> tuple[int, int]:
         """Return begin and end of this rank's share of ``count`` pieces of work."""
         return count * self.rank // self.size, count * (self.rank + 1) // self.size
 
     def merge(self, array) -> None:
-        """Add a contiguous Warp array over all ranks. Each 32-bit word may be nonzero on one rank only."""
+        """Sum a contiguous Warp array over all ranks, in place. Each 32-bit word may be nonzero on one rank only."""
         if array.device.is_cuda:
             self._gpus = self._gpus or _Nccl(self, array.device)
             self._gpus.merge(array)
@@ -217,7 +217,7 @@ class Ranks:
         self._all.Allreduce(self._mpi.IN_PLACE, array.numpy().reshape(-1).view(np.int32), self._mpi.SUM)
 
     def exchange(self, value: Any, error: Exception | None = None) -> list:
-        """Return the values of all ranks; if ranks have an error, all raise the error of the first of them."""
+        """Return the values of all ranks. If ranks pass an error, all ranks raise the error of the first of them."""
         others = range(self.size) if error is not None else ()
         notices = [self._failures.isend(None, other) for other in others if other != self.rank]
         kind = type(error) if isinstance(error, (InputError, SimulationError)) else RuntimeError
@@ -268,7 +268,7 @@ class Ranks:
 
     def _fail_uncaught(self, kind, error, trace) -> None:
         """Show an uncaught exception, and abort the other ranks, which would wait for this rank."""
-        self.fail(str(error), 1, lambda _: self._show(kind, error, trace))
+        self.fail(str(error), 1, lambda _: self._excepthook(kind, error, trace))
 
 
 class _Nccl:
@@ -282,7 +282,7 @@ class _Nccl:
             self._library = library = ctypes.CDLL(_nccl_path())
         except OSError as error:
             raise InputError(f"device: ranks on GPUs need nvidia-nccl-cu12 or -cu13 of pip ({error})") from None
-        self._current = wp.ScopedDevice
+        self._scoped_device = wp.ScopedDevice
         library.ncclGetErrorString.restype = ctypes.c_char_p
         identifier = (ctypes.c_char * _ID_BYTES)()
         if ranks.rank == 0:
@@ -298,7 +298,7 @@ class _Nccl:
         """Launch :meth:`Ranks.merge` on the stream of the device."""
         words = ctypes.c_size_t(array.shape[0] * array.strides[0] // 4)
         place, stream = ctypes.c_void_p(array.ptr), ctypes.c_void_p(array.device.stream.cuda_stream)
-        with self._current(array.device):
+        with self._scoped_device(array.device):
             self._check(self._library.ncclAllReduce(place, place, words, _INT32, _SUM, self._communicator, stream))
 
     def _check(self, result: int) -> None:

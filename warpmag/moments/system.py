@@ -156,7 +156,7 @@ class MomentSystem:
         self._fast = fast_sums_for(settings.method, self._packed, layout, body_extent, float(settings.rtol))
         self.is_fast = isinstance(self._fast, SystemSums)
         self._make_field(layout, near)
-        self._make_cells(layout, couplings, whole=theta)
+        self._make_cells(layout, couplings, responses=theta)
         self._make_wrench(layout, rotatable)
         self._permanent_fields = None
         self._near = self._make_near_contacts(layout, rotatable, susceptibility) if near else None
@@ -222,13 +222,13 @@ class MomentSystem:
         more = {"extra_parts": int(near), "sums": self._inducible_sums, "ranks": self._ranks}
         self._inducible_field = PairEvaluation(Quantity.FIELD, of_inducible, packed, packed, state.h0, self.h, **more)
 
-    def _make_cells(self, layout: MomentLayout, couplings, whole: bool):
-        """Prepare the corrections between cells; ``whole`` is True if small bodies respond collectively."""
+    def _make_cells(self, layout: MomentLayout, couplings, responses: bool):
+        """Prepare the corrections between cells; ``responses`` is True if small bodies respond collectively."""
         worlds = [(first, middle) for first, middle, _ in layout.ranges()]
         self._cells = self.rotations = None
         if couplings:
-            as_wholes = [whole and len(coupling.radii) <= MOST_CELLS for _, coupling in couplings]
-            self._cells = CellCouplings(couplings, worlds, self._packed, self.moments, self.h, as_wholes)
+            collective = [responses and len(coupling.radii) <= MOST_CELLS for _, coupling in couplings]
+            self._cells = CellCouplings(couplings, worlds, self._packed, self.moments, self.h, collective)
             self.rotations = self._cells.rotations
 
     def _make_responses(self, layout: MomentLayout, couplings) -> BodyResponses | None:
@@ -427,8 +427,8 @@ class MomentSystem:
     def energy(self) -> np.ndarray:
         """Return the energy of each world's moments after :meth:`solve` [J], float64, shape [worlds].
 
-        It is the energy of all fields and of the magnetization curves. The negative gradient by the positions is the
-        Kelvin force. Permanent moments of one body add a constant. Waits for the device.
+        It is the energy of all fields and of the magnetization curves. Its negative gradient with respect to positions
+        is the Kelvin force. Permanent moments of one body add a constant. Waits for the device.
         """
         if self.settings.contact_model != "dipole":
             raise InputError("contact_model: the energy can be computed for dipole only, not for multipole")

@@ -35,7 +35,7 @@ class CellGrid:
     """Equal cells over shapes, in the frame of the largest. Along each axis they fit the thinnest shape exactly."""
 
     solids: list[Solid]  # shapes posed in the frame of the grid
-    earlier: int  # number of shapes without cells that only remove overlap, the first of ``solids``
+    earlier: int  # number of leading ``solids`` that get no cells and only remove overlap
     lower: np.ndarray  # lower corner [m], shape [3]
     sides: np.ndarray  # sides of a cell [m], shape [3]
     counts: np.ndarray  # cells along each axis, shape [3]
@@ -98,7 +98,7 @@ class CellGrid:
 
 
 def cells_over(parts: Sequence[Solid], earlier: Sequence[Solid], spacing: float, across: int) -> CellGrid:
-    """Return a grid of cells with sides of about ``spacing`` [m] over ``parts`` of a body, without ``earlier`` shapes.
+    """Return a grid of cells with sides of about ``spacing`` [m] over ``parts`` of a body outside ``earlier`` shapes.
 
     ``across`` is the smallest number of cells across a shape. In a shared grid ``_FLATTEST`` limits it.
     """
@@ -132,7 +132,7 @@ def _in_frame_of(frame: Solid, part: Solid) -> Solid:
 
 
 def _inside(part: Solid, others: list[Solid], points: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return the number of points in a shape, and True for the points that lie in it and in no other."""
+    """Return the number of points in ``part``, and True for each point in ``part`` but in none of ``others``."""
     free = part.contains(points)
     inside = int(free.sum())
     for other in others:

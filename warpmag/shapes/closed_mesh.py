@@ -32,7 +32,7 @@ def welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def check_closed(triangles: np.ndarray) -> None:
-    """Raise ``InputError`` unless the triangles pass every edge equally often in both directions."""
+    """Raise ``InputError`` unless the triangles traverse every edge equally often in both directions."""
     start, end = triangles.reshape(-1), np.roll(triangles, -1, axis=1).reshape(-1)
     edges, edge = np.unique(np.sort(np.stack([start, end], axis=1), axis=1), axis=0, return_inverse=True)
     balance = np.bincount(edge.reshape(-1), np.where(start < end, 1.0, -1.0))
@@ -48,8 +48,7 @@ def winding_number(points: np.ndarray, triangles: np.ndarray) -> Callable[[np.nd
 
     The function counts the triangles that a ray along +z crosses. A ray through an edge or a vertex counts exactly
     once: the side of an edge is computed from its end points in the order of their indices, and is thus the same for
-    both triangles.
-    Triangles are sorted into rectangular columns along z, so that a point tests only the triangles of its column.
+    both triangles. Triangles are sorted into rectangular columns along z: a point tests the triangles of its column.
     """
     corners = points[triangles]
     flat = corners[:, :, :2]

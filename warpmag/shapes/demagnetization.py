@@ -33,12 +33,12 @@ _DISTANT_SUBCELLS = 4
 _FAR_REACH = 4.0
 """Distance up to which quadrupoles of cells are corrected, in :data:`EXACT_REACH`."""
 _LARGEST_SPREAD = 0.15
-"""Bound on the norm of a moment's traceless second moments, in squares of a cell's longest side. Two joined cubic cells
-have 0.2."""
+"""Bound on the norm of the traceless second moments of a moment's volume, in squares of a cell's longest side. Two
+joined cubic cells have 0.2."""
 COMPONENTS = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
 """Rows and columns of the six components of a symmetric tensor: xx, yy, zz, xy, xz, yz."""
 _LANCZOS_STEPS = 20
-"""Largest number of Lanczos steps; they give the largest eigenvalue to 3 %."""
+"""Largest number of Lanczos steps; the largest eigenvalue then has an error of 3 %."""
 _BATCH = 1 << 22
 """Largest number of entries of a temporary array (tens of MB)."""
 

@@ -1,10 +1,10 @@
 """Lattices of moments that fill a solid body.
 
 A body that is not a ball is replaced by moments of volume Vᵢ at xᵢ. ΣVᵢ is the volume of the body, and ΣVᵢxᵢ/ΣVᵢ its
-centroid. Nearly cubic cells divide the bounding box of each shape exactly. The moment of a cell is
-at the centroid of the part that the shape fills. Cells filled by less than half join their nearest neighbor, so that a
-curved surface has neither steps nor slivers. The filled part is found from a fine grid of test points. Where shapes of
-a body overlap, each test point counts once.
+centroid. Nearly cubic cells divide the bounding box of each shape exactly. The moment of a cell is at the centroid of
+the part that the shape fills. Cells filled by less than half join their nearest neighbor, so that a curved surface has
+neither steps nor slivers. The filled part is found from a fine grid of test points. Where shapes of a body overlap,
+each test point counts once.
 
 The accuracy determines :data:`AUTOMATIC_COUNT`. The table lists errors of a uniformly magnetized cube of side L as n³
 point dipoles. The field's error is a relative L2 norm over all points at distance d from the surface. The force acts on
@@ -157,7 +157,7 @@ def cone(radius: float, half_height: float) -> Solid:
 def mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
     """Return the solid that a closed triangle mesh bounds.
 
-    Vertices at the same position are joined first. The triangles must then pass every edge equally often in both
+    Vertices at the same position are joined first. The triangles must then traverse every edge equally often in both
     directions; either orientation of the whole mesh is accepted. Shells may intersect; shared volume counts once.
     ``vertices`` [m] have the shape [n, 3]; ``faces`` are triples of their indices, shape [k, 3] or flat.
     """
@@ -197,7 +197,7 @@ def fits(boxes: Sequence[np.ndarray], spacing: float) -> bool:
 
 
 def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1, *, together: bool = False) -> Lattice:
-    """Fill a body with moments. Their total volume is exact, or to about 1 % if shapes overlap.
+    """Fill a body with moments. Their total volume is exact, or accurate to about 1 % if shapes overlap.
 
     Args:
         solids: Shapes of one body, posed in its frame. Overlap belongs to the earlier shape.

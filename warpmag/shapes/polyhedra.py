@@ -19,9 +19,9 @@ import numpy as np
 CYLINDER_SIDES = 32
 """Number of sides of the prism that replaces a cylinder."""
 _LEAST_POINTS, _EDGE_POINTS, _FACE_POINTS, _FINE_FACE_POINTS = 4, 16, 8, 32
-"""Numbers of Gauss points: at least on an edge; on the longest edge; across a face as long as that edge; and across it
-for energies. Forces between touching boxes then have an error of 2e-3 at any offset. Only torques and energies use
-points on faces. The potential has a kink on a face near an edge of the other body. For two boxes half a millimeter
+"""Numbers of Gauss points: minimum on an edge; on the longest edge; across a face as long as that edge; and across such
+a face for energies. Forces between touching boxes then have an error of 2e-3 at any offset. Only torques and energies
+use points on faces. The potential has a kink on a face near an edge of the other body. For two boxes half a millimeter
 apart, 8 points give the force to 1e-5, but the slope of the energy only to 3 %; energies therefore use more."""
 _REACH, _REMAINDER, _MOST_MOMENTS = 1.5, 1e-5, 256
 """For the moments that replace a body at a distance: smallest distance, in halves of the body's smallest side; relative
@@ -115,8 +115,8 @@ def cylinder(radius: float, half_height: float) -> Polyhedron:
 def box_moments(half_extents) -> Moments:
     """Return the moments of a box of half sides ``half_extents`` [m], shape [3], centered at the origin."""
     half = np.asarray(half_extents, float)
-    lines, distance = _planned(half.min(), lambda distance: [_line(h, distance) for h in half])
-    (x, wx), (y, wy), (z, wz) = (_along(h, *line) for h, line in zip(half, lines, strict=True))
+    lines, distance = _planned(half.min(), lambda distance: [_panels_and_points(h, distance) for h in half])
+    (x, wx), (y, wy), (z, wz) = (_gauss_points_on_line(h, *line) for h, line in zip(half, lines, strict=True))
     positions = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
     shares = (wx[:, None, None] * wy[:, None] * wz).ravel()
     return Moments(positions, 8.0 * half.prod() * shares, (half - np.abs(positions)).min(axis=1), distance)
@@ -126,11 +126,11 @@ def cylinder_moments(radius: float, half_height: float) -> Moments:
     """Return the moments of a cylinder along z of ``radius`` and ``half_height`` [m] at the origin, in rings."""
 
     def plan(distance):
-        _, order = _line(radius, max(distance, radius / 1e3), 1)
-        return [_line(half_height, distance), (order // 2 + 1, 2 * order + 1)]
+        _, order = _panels_and_points(radius, max(distance, radius / 1e3), 1)
+        return [_panels_and_points(half_height, distance), (order // 2 + 1, 2 * order + 1)]
 
     (line, (rings, around)), distance = _planned(min(radius, half_height), plan)
-    (squared, area), (z, height) = _gauss(rings), _along(half_height, *line)
+    (squared, area), (z, height) = _gauss(rings), _gauss_points_on_line(half_height, *line)
     angle = 2.0 * np.pi / around * np.arange(around)
     r, phi, z = np.meshgrid(radius * np.sqrt(squared), angle, z, indexing="ij")
     positions = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1).reshape(-1, 3)
@@ -140,9 +140,9 @@ def cylinder_moments(radius: float, half_height: float) -> Moments:
 
 
 def _planned(half: float, plan):
-    """Return ``plan(distance)``, (panels, points) per axis, and the distance, at least ``_REACH * half`` [m].
+    """Return ``plan(distance)``, which is (panels, points) per axis, and the distance [m].
 
-    The distance is the smallest one for a plan of at most :data:`_MOST_MOMENTS` moments.
+    The distance is the smallest from ``_REACH * half`` on with a plan of at most :data:`_MOST_MOMENTS` moments.
     """
     distance = _REACH * half
     while np.prod(plan(distance)) > _MOST_MOMENTS:
@@ -150,16 +150,17 @@ def _planned(half: float, plan):
     return plan(distance), distance
 
 
-def _line(half: float, distance: float, panels: int = 0) -> tuple[int, int]:
-    """Return the number of panels of a line, at most ``distance`` long, and the number of Gauss points in each.
+def _panels_and_points(half: float, distance: float, panels: int = 0) -> tuple[int, int]:
+    """Return the number of panels of a line of length 2 ``half``, and the number of Gauss points in each.
 
-    The error of n points at that distance falls off as exp(−2n arsinh(distance/half a panel)).
+    Half a panel is at most ``distance`` long. The error of n points at that distance falls off as
+    exp(−2n arsinh(distance/half a panel)).
     """
     panels = panels or int(np.ceil(half / distance))
     return panels, max(1, int(np.ceil(-np.log(_REMAINDER) / (2.0 * np.arcsinh(distance * panels / half)))))
 
 
-def _along(half: float, panels: int, points: int) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_points_on_line(half: float, panels: int, points: int) -> tuple[np.ndarray, np.ndarray]:
     """Return Gauss points on a line from −half to half, and their weights, which sum to 1."""
     nodes, shares = _gauss(points)
     positions = (np.arange(panels)[:, None] + nodes).ravel() / panels

@@ -76,7 +76,7 @@ def _python() -> str:
     """Return the path of a Python that has Blender."""
     if path := os.environ.get(BLENDER):
         if not os.access(path, os.X_OK):
-            raise InputError(f"{BLENDER}: {path} is no Python that can be started")
+            raise InputError(f"{BLENDER}: {path} is not a Python that can be started")
         return path
     if importlib.util.find_spec("bpy"):
         return sys.executable

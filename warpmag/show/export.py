@@ -14,7 +14,7 @@ from warpmag.usd import Recording, open_animated, read_recording, usable_path
 from warpmag.usd.write.output import Output
 
 _TOP = 0.99
-"""Quantile of all values at the end of the color scale, so that a few collisions do not compress the scale."""
+"""Quantile of the values at which the color scale ends, so that a few collisions do not compress the scale."""
 
 
 def export(

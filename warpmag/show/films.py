@@ -13,7 +13,7 @@ from warpmag.errors import InputError, extra
 FILMS = (".mp4", ".gif")
 SUFFIXES = (".png", *FILMS)
 _GIF_RATE = 25.0
-"""Largest rate of a GIF [Hz]: players slow down faster ones."""
+"""Largest rate of a GIF [Hz]: players slow down faster GIFs."""
 
 
 def check_name(output: Path) -> None:
@@ -25,7 +25,7 @@ def check_name(output: Path) -> None:
 
 
 def write(output: Path, pictures: Iterable[np.ndarray], frames: list[int], rate: float) -> list[Path]:
-    """Write one file for a film, else one for each picture; names of several contain the numbers of the frames.
+    """Write one file for a film, else one for each picture. Names of several pictures contain the frame numbers.
 
     Pictures are 8-bit sRGB, shape [height, width, 3]; an iterator may make them one by one. The rate of a film is in
     pictures per second [Hz]. Returns the files; raises :class:`InputError` if one cannot be written.

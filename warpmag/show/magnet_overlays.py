@@ -105,7 +105,7 @@ class MagnetOverlays:
             return h_field(positions, moments, points * unit, radii=self._radii * unit, device=device) + external
 
         def ends(points):
-            """Return true for points inside a magnet, or far from all magnets."""
+            """Return True for points inside a magnet, or far from all magnets."""
             inside, near = np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
             for magnet in sources.tolist():
                 low, high = self._boxes[magnet]

@@ -1,4 +1,4 @@
-"""Draws frames of a stage by ray tracing on any device, a CPU too: pictures and films without a renderer.
+"""Draws frames of a stage by ray tracing on any device, as pictures or films, without an external renderer.
 
 The stage may be a scene or the recording of a run: bodies stand at the poses of their time samples. Newton's camera
 sensor traces the model. It uses the shapes, colors and first camera of the stage. Without a camera, the view shows all
@@ -36,7 +36,7 @@ _VIEW = (0.55, -0.75, 0.4)
 _FIELD_OF_VIEW = math.radians(30.0)
 _ARROW_COLOR = (1.0, 0.55, 0.05)
 _LEAST_SHOWN = 0.02
-"""Ratio of moment to cubed size, over the largest such ratio, up to which a magnet gets no arrow."""
+"""A magnet gets no arrow up to this fraction of the largest ratio of moment to cubed size."""
 _SUN = (-0.4, 0.55, -0.73)
 """Direction of the sun's light."""
 _AMBIENT = ((0.5, 0.53, 0.58), (0.22, 0.21, 0.2))
@@ -62,7 +62,7 @@ def render(
     Args:
         stage: USD file.
         output: ``.png`` for pictures; ``.mp4`` or ``.gif`` for a film, at the stage's frame rate.
-        frame: Frame after the start, at the stage's frame rate; by default the last one, for films all.
+        frame: Frame after the start, at the stage's frame rate; by default the last, for a film all frames.
         frames: First and last frame of several; the name of each picture contains the number of its frame.
         size: Width and height [px].
         moments: Show the moments of the recording as arrows.
@@ -161,7 +161,7 @@ class _Renderer:
 
 
 class _Arrows:
-    """Cones on magnets along their moments, added to the builder of a scene; an error if it has no moments."""
+    """Cones on magnets along their moments, in the builder of a scene. A scene without moments raises an error."""
 
     def __init__(self, scene: ImportedScene, path):
         self._prims = list(scene.magnet_shapes)

@@ -1,8 +1,8 @@
 """A stage for renderers from a scene and its motion: instanced meshes, materials, lights, a camera, no physics.
 
 Bodies become instances of two PointInstancers, one of balls and one of other bodies: importers drop the materials of
-spheres and cubes, or make an object of each. Other drawn prims become meshes in place. The stage has a rate of time
-codes per second that players keep; its time samples are at the times of the recording.
+spheres and cubes, or make an object of each. Other drawn prims become meshes in place. The rate of time codes per
+second is one at which players play. Time samples are at the times of the recording.
 """
 
 import os
@@ -47,11 +47,11 @@ class DrawnShape:
     path: str  # of the shape's prim
     row: int  # of the body in the recording, -1 for a static shape
     frame: np.ndarray  # of the prim in the frame of the body, or in the world, shape [4, 4], for rows of points
-    drawn: bool  # true if the shape is visible
+    drawn: bool  # True if the shape is visible
     radius: float  # of a ball, 0 for other shapes
     points: np.ndarray  # in the frame of the body, or in the world, shape [k, 3]; empty for a ball
     faces: list[np.ndarray]  # corners of each face
-    appearance: tuple = ()  # path of the bound material, or "", and display color, or ()
+    appearance: tuple = ()  # path of the bound material or "", and display color or ()
 
     @property
     def center(self) -> np.ndarray:
@@ -131,7 +131,7 @@ class RendererStage:
         return shapes
 
     def _instanced(self) -> np.ndarray:
-        """Return true for bodies that are drawn as instances, shape [n]: moving bodies, dynamic bodies and magnets."""
+        """Return True for bodies that are drawn as instances, shape [n]: moving bodies, dynamic bodies and magnets."""
         record, magnets = self.recording, set(self.recording.magnets)
         instanced = np.ptp(record.positions, axis=0).any(axis=1) | np.ptp(record.rotations, axis=0).any(axis=1)
         for row, path in enumerate(record.bodies):
@@ -284,7 +284,7 @@ class RendererStage:
 
 def _scene_of(source: Usd.Stage, instancers: Sequence[BallInstancer], rate: float) -> Sdf.Layer:
     """Return the scene without the layers of runs, as one layer with ``rate`` time codes per second."""
-    # the layer has a prim for each instance, as in the run; of ``instancers`` only for balls that differ from the rest
+    # the layer has a prim for each instance, but of ``instancers`` only for balls that differ from the other balls
     root = source.GetRootLayer()
     top = Sdf.Layer.CreateAnonymous(".usda")
     for key in copied_metadata(root):

@@ -17,7 +17,7 @@ _FIELD_OF_VIEW = math.radians(45.0)
 _COLORS = np.array([(0.27, 0.0, 0.33), (0.13, 0.57, 0.55), (0.99, 0.91, 0.14)])
 """Colors of zero, half and the largest magnetization: three colors of viridis."""
 _LENGTH = 1.6
-"""Half the longest arrow over the radius of its shape; both ends stick out of the shape."""
+"""Half length of the longest arrow over the radius of its shape; both ends stick out of the shape."""
 _PAUSE = 1.0 / 60.0
 """Interval at which the buttons of a viewer are polled while it is paused or shows the last frame [s]."""
 

@@ -1,4 +1,4 @@
-"""Makes a web page, to orbit and play, of a stage for renderers: a recording of viser inside viser's own client."""
+"""Makes a web page of a stage for renderers, to orbit and play: a viser recording inside viser's own client."""
 
 import contextlib
 import functools
@@ -26,9 +26,9 @@ _DIRECTION = (0.55, -0.75, 0.45)
 """Direction from the bodies to the camera of a stage that has none; z is up."""
 _FIELD_OF_VIEW = math.radians(35.0)
 _LAST = 1.0
-"""Time of the last frame before the page plays again [s]."""
+"""Duration of the last frame before the page plays again [s]."""
 _FAR_TRIANGLES, _FAR_RADII = 400_000, 20.0
-"""Triangles of all copies of a mesh beyond a distance, and that distance over the radius of the mesh."""
+"""Largest number of triangles of all distant copies of a mesh, and their least distance over the mesh's radius."""
 _GRAY = (0.5, 0.5, 0.5)
 
 

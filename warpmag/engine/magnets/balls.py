@@ -1,4 +1,4 @@
-"""Adds many balls at once: Newton's own calls make one ball, and Newton replicates it."""
+"""Adds many balls at once: Newton's own calls add one ball, and Newton replicates it."""
 
 import math
 from dataclasses import dataclass
@@ -107,7 +107,7 @@ def add_balls(
 def copy_ball(
     builder: newton.ModelBuilder, body: int, poses: np.ndarray, velocities: np.ndarray, prefix: str, prefixes: list[str]
 ) -> Balls:
-    """Add copies of a free body with one shape, a ball, magnet included; return the bodies and shapes of the copies.
+    """Add copies of a free ball, a body with one shape, and of its magnet; return the bodies and shapes of the copies.
 
     Args:
         builder: The builder.
@@ -115,7 +115,7 @@ def copy_ball(
         poses: Positions [m] and quaternions x y z w, shape [n, 7].
         velocities: Linear [m/s] and angular velocities [rad/s], world frame, shape [n, 6].
         prefix: Prefix of the labels of the body and its shape.
-        prefixes: Prefix of the labels of each copy, in its place.
+        prefixes: Prefix of the labels of each copy, in place of ``prefix``.
     """
     (shape,) = builder.body_shapes[body]
     originals, count = {"body": body, "shape": shape}, len(poses)

@@ -80,7 +80,7 @@ def add_permanent(
         builder: The builder, with :func:`register_custom_attributes` called on it.
         body: The body. All its colliding shapes, which must exist already, become one magnet.
         shape: One shape in place of all shapes of the body, for example a static shape.
-        material: Name of a permanent material of :mod:`warpmag.declarations.materials`, which gives the strength.
+        material: Name of a permanent material of :mod:`warpmag.declarations.materials`, which sets the strength.
         magnetization: Magnetization M [A/m] in the frame of the body, or of a static shape. With ``material`` only
             its direction counts.
         recoil_permeability: μ of M = M_r + (μ − 1) H [dimensionless], with the internal field H and ``magnetization``
@@ -109,7 +109,7 @@ def add_permanent(
 
 
 def in_shape_frame(magnet: Magnet, rotation: wp.quat) -> Magnet:
-    """Return a magnet in the frame of a shape; ``rotation`` leads from there to the frame of its body or prim."""
+    """Return a magnet in the frame of a shape; ``rotation`` is from that frame to the magnet's, of a body or prim."""
     if not np.any(magnet.magnetization):
         return magnet
     return replace(magnet, magnetization=tuple(wp.quat_rotate_inv(rotation, wp.vec3(*magnet.magnetization))))

@@ -26,7 +26,7 @@ class BodyMagnet:
 def find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
     """Return the magnets of a model, and the Newton worlds with magnets, [-1] for a model without worlds.
 
-    Magnets are sorted by world, then solved before fixed magnetizations, then by body.
+    Magnets are sorted by world, then magnets of the induction solve before fixed magnets, then by body.
     """
     magnet_of_shape = marked_shapes(model)
     shapes, stored = np.array(list(magnet_of_shape)), list(magnet_of_shape.values())
@@ -84,7 +84,7 @@ def _in_body_frame(magnet: Magnet, rotation: list[float]) -> Magnet:
 
 
 def _same_magnet(a: Magnet, b: Magnet) -> bool:
-    """Return true if two magnets of one body have equal materials, and equal magnetizations up to rounding."""
+    """Return True if two magnets of one body have equal materials, and equal magnetizations up to rounding."""
     if a is b:
         return True
     if replace(a, magnetization=b.magnetization) != b:

@@ -38,7 +38,7 @@ from warpmag.terminal import collection_paused
 class Magnetics:
     """The magnets of a Newton model: their induction, forces and fields.
 
-    A ball is one moment. Any other shape is a lattice of moments with the exact total. Moments of one body exert no
+    A ball is one moment. Any other shape is a lattice of moments with the exact volume. Moments of one body exert no
     forces on each other, and magnets of different worlds do not interact. Use any solver that reads ``State.body_f``::
 
         magnetics = warpmag.Magnetics(model)
@@ -51,8 +51,8 @@ class Magnetics:
         magnets: The magnets, in the order of their moments.
         system: The moments on the device.
         shapes: Indices of the magnetic shapes, in the order of :meth:`shape_moments`, shape [n].
-        shape_volumes: Magnetic volume of each of these shapes [m³], shape [n]. Where
-            shapes of one body overlap, the common volume belongs to the first of them.
+        shape_volumes: Magnetic volume of each of these shapes [m³], shape [n]. Where shapes of one body overlap, the
+            common volume belongs to the first of them.
     """
 
     @collection_paused()
@@ -211,7 +211,7 @@ class Magnetics:
                 also need velocities, ``body_qd``.
 
         Raises:
-            InputError: ``model.warpmag`` has changed, see :meth:`notify_model_changed`. On a GPU some calls later.
+            InputError: ``model.warpmag`` has changed, see :meth:`notify_model_changed`; with a GPU some calls later.
         """
         self.induce(state)
         self.add_forces(state)
@@ -361,7 +361,7 @@ class Magnetics:
         Args:
             points: The points [m], shape [p, 3], or a Warp array of vectors on the model's device.
             worlds: World of each point, a number or shape [p]; by default the only world with magnets.
-            gradients: Measure gradients as well.
+            gradients: Compute gradients as well.
 
         Raises:
             InputError: A point is not finite or too far away (see ``warpmag.moments.arrays``), or its world holds no

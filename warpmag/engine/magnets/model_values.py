@@ -1,8 +1,8 @@
 """Detects changes of ``model.warpmag`` after ``Magnetics`` was built.
 
 Magnetizations are read in every substep. All other attributes are copied once, into buffers, tables and lattices. The
-kernel that gathers moments detects changes on the device. The host raises the error, with a GPU some calls later, so
-that it does not wait.
+kernel that gathers moments detects changes on the device. The host raises the error. With a GPU it does so some calls
+later, because it does not wait.
 """
 
 from typing import Any
@@ -25,7 +25,7 @@ _MODEL_ARRAYS = (
     *("body_q", "body_com", "body_flags"),
     *("shape_body", "shape_type", "shape_transform", "shape_scale", "shape_world"),
 )
-"""Other arrays of a model that determine its magnets, besides meshes."""
+"""Further arrays of a model that determine its magnets. Meshes determine them, too."""
 
 
 def magnetic_arrays(model: newton.Model) -> dict[str, Any]:

@@ -51,7 +51,7 @@ class ModelSources:
             self.applied.append(AppliedSource(kind, record.parameters, record.table, world, body, movable))
 
     def bind(self, system: MomentSystem) -> None:
-        """Set the system, made with :attr:`applied`, that the other methods write to."""
+        """Set the system that the other methods write to; it was made with :attr:`applied`."""
         self._system, model = system, self._model
 
         def on_device(values):

@@ -59,7 +59,7 @@ def _transform(matrix: np.ndarray) -> wp.transform:
 
 
 def _is_source(prim: Any, _) -> bool:
-    """Return true if a prim is a coil or a field map."""
+    """Return True if a prim is a coil or a field map."""
     from warpmag.usd import is_source  # noqa: PLC0415 - a builder can do without USD
 
     return is_source(prim)

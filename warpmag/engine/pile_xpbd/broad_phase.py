@@ -13,7 +13,7 @@ _TYPES = (newton.GeoType.PLANE, newton.GeoType.SPHERE, newton.GeoType.CAPSULE, n
 
 
 def are_colliding(model: newton.Model) -> np.ndarray:
-    """Return true for each shape that collides with other shapes, shape [shape_count]."""
+    """Return True for each shape that collides with other shapes, shape [shape_count]."""
     return (model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES) != 0
 
 
@@ -57,7 +57,7 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
         arrays.contacts = view_contacts(self._model, contacts)
 
     def _may_leave_pairs(self, kinds: np.ndarray) -> bool:
-        """Return true if a moving shape is not a ball, or if Newton has to find contacts of balls with some shape."""
+        """Return True if a moving shape is not a ball, or if Newton has to find contacts of balls with some shape."""
         model, kinematic = self._model, newton.BodyFlags.KINEMATIC
         flags = np.append(model.body_flags.numpy(), kinematic)  # the last entry is for shapes without a body, -1
         body: np.ndarray = model.shape_body.numpy()

@@ -21,7 +21,7 @@ from warpmag.kernels.rigid.newton_views import view_bodies, view_contacts
 _NEWTON_GAP = 0.1
 """Newton's default contact gap [m], ``ModelBuilder.rigid_gap``."""
 _GAP = 0.1
-"""Contact gap of a shape over the thickness of its body: contacts are found a tenth of a radius ahead."""
+"""Contact gap of a shape over the thickness of its body: contacts are found within a tenth of a ball's radius."""
 _CONTACTS_PER_BALL, _CONTACTS_PER_SHAPE, _PAIRS_PER_SHAPE = 8, 12, 40
 """Initial sizes of the buffers. The densest packing has 6 contacts per ball, a wall of boxes 12 per box.
 A contact takes about 600 bytes on a GPU."""
@@ -30,7 +30,7 @@ _GROWTH = 1.5
 _MAX_SORTED_PAIRS = 2**20
 """Largest number of triangle pairs that Newton sorts."""
 _KINDS = ("contact", "pair", "triangle")
-"""Kinds of buffers."""
+"""Kinds of buffers: contacts, pairs of shapes, pairs of triangles."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ class RigidSolver:
             self.buffers.append(Buffer("contact", overflow_flags, 0))
 
     def _sorts_contacts(self) -> bool:
-        """Return true if Newton has to sort contacts: with meshes on a GPU, so that every run has the same contacts.
+        """Return True if Newton has to sort contacts: with meshes on a GPU, so that every run has the same contacts.
 
         Contacts of other shapes arrive in any order; the solver sorts them.
         """

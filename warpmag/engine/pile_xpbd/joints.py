@@ -25,7 +25,7 @@ _PINS = (newton.JointType.REVOLUTE, newton.JointType.BALL, newton.JointType.FIXE
 _UNDRIVEN = (newton.JointType.FREE, newton.JointType.DISTANCE, newton.JointType.BALL, newton.JointType.FIXED)
 """Types of joints without drives."""
 _UNROLLED = 6
-"""Iterations in the body of the loop in a graph. A graph with all iterations takes seconds to make."""
+"""Largest number of iterations in the loop body of a graph. A graph of all iterations takes seconds to capture."""
 
 
 class JointSolve:
@@ -165,15 +165,15 @@ def _axis_counts(model: newton.Model) -> np.ndarray:
 
 
 def are_pins(model: newton.Model) -> np.ndarray:
-    """Return true for each joint that keeps two points together and does not slide, shape [joints]."""
+    """Return True for each joint that keeps two points together and does not slide, shape [joints]."""
     return np.isin(model.joint_type.numpy(), _PINS) & (_axis_counts(model)[:, 0] == 0)
 
 
 def _drive_rows(model: newton.Model) -> tuple[np.ndarray, np.ndarray]:
-    """Return the axes with drives that ``kernels.contacts.joints`` evaluates, and a mask of the others, shape [dofs].
+    """Return the axes with drives that ``kernels.contacts.joints`` evaluates, and a mask of other axes, shape [dofs].
 
     A row is the joint, the degree of freedom, the index of the target, and 1 for an angular axis, shape [rows, 4].
-    Newton evaluates the drives of the others: the axes of joints with several angular axes.
+    Newton evaluates the drives of the masked axes: angular axes of joints with several angular axes.
     """
     rows, newton_dofs = [], np.ones(model.joint_dof_count, dtype=bool)
     types, counts = model.joint_type.numpy(), _axis_counts(model)

@@ -17,7 +17,7 @@ class SolverKind:
     maximal: bool = False  # moves poses of bodies, so that joints need no articulation
     resumable: bool = True  # has no hidden state between steps, so that a checkpoint is complete
     contacts_at_end: bool = False  # evaluates contacts at the end of a step, and needs kinematic bodies posed there
-    warning: str = ""  # known weakness, in one line for the user
+    warning: str = ""  # known weakness, one line for the user
 
 
 def _xpbd(model, contact_max: int):
@@ -72,7 +72,7 @@ SOLVERS = {
         "bodies lose several percent of a swing; xpbd does not have these faults",
     ),
 }
-"""Rigid-body solvers by name. The first is the default, and piles are tested with it."""
+"""Rigid-body solvers by name. The first is the default, which is tested with piles."""
 MAXIMAL = tuple(name for name, kind in SOLVERS.items() if kind.maximal)
 """Names of the solvers in maximal coordinates."""
 

@@ -2,12 +2,12 @@
 
 Newton's solver launches every iteration over the whole contact buffer and sums with atomics, in an order that differs
 between runs. Here ``kernels.contacts.solve`` moves free bodies. It enforces the same contact conditions, processes
-active contacts only, and sums in a fixed order. It conserves momentum and angular momentum, unlike Newton's lever arms
-and damping of spins, and needs half the iterations (``kernels/contacts/contact_law.h``).
+active contacts only, and sums in a fixed order. It conserves momentum and angular momentum, which Newton's lever arms
+and damping of spins do not. It needs half the iterations (``kernels/contacts/contact_law.h``).
 
 Where no impulse overshoots, the result equals Newton's. In heaps impulses overshoot. Newton never reduces them, so that
-its result depends on the relaxation factor. Here the result without friction is the smallest impulses that leave no
-overlap; with friction it satisfies Coulomb's law. Sticking contacts store their slip distance, so that heaps do not
+its result depends on the relaxation factor. Here impulses without friction are the smallest that leave no overlap, and
+impulses with friction satisfy Coulomb's law. Sticking contacts store their slip distance, so that heaps do not
 creep. Overlapping bodies are moved apart at 2 m/s at most.
 
 Contacts at the corners of boxes that lie face to face overshoot together. The mass of each body is therefore split
@@ -46,7 +46,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
     def __init__(self, model: newton.Model, contact_max: int, *, contact_iterations: int | None = None, **settings):
         """Set up Newton's solver with ``settings``, for contact buffers of ``contact_max`` entries.
 
-        ``kernels.contacts.solve`` has ``contact_iterations``, by default Newton's ``iterations``.
+        ``kernels.contacts.solve`` runs ``contact_iterations``, by default Newton's ``iterations``.
         """
         super().__init__(model, **settings)
         split_bodies = _find_split_bodies(model, self.body_inv_mass_effective.numpy())

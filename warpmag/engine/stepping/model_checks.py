@@ -52,8 +52,8 @@ def _check_joint_springs(model: newton.Model, solver: str, dt: float) -> None:
     constrained = np.flatnonzero(~np.isin(model.joint_type.numpy(), (newton.JointType.FREE, newton.JointType.DISTANCE)))
     if not len(constrained):
         return
-    spins = np.linalg.eigvalsh(np.asarray(model.body_inv_inertia.numpy(), dtype=float)).max(axis=1)
-    gains = np.maximum(model.body_inv_mass.numpy(), spins) * SPRING_STIFFNESS * dt**2
+    inv_inertias = np.linalg.eigvalsh(np.asarray(model.body_inv_inertia.numpy(), dtype=float)).max(axis=1)
+    gains = np.maximum(model.body_inv_mass.numpy(), inv_inertias) * SPRING_STIFFNESS * dt**2
     for joint in constrained:
         bodies = model.joint_parent.numpy()[joint], model.joint_child.numpy()[joint]
         if max(gains[body] for body in bodies if body >= 0) > 1.0:

@@ -69,7 +69,7 @@ class Recorder:
     def resume(self, frames: int, steps: int, step_size: float) -> tuple[bool, bool]:
         """Continue the run at the output; the whole run has ``frames``, and ``steps`` of ``step_size`` [s].
 
-        Return true if there was a run, and true if it is complete. A run that cannot be resumed raises
+        Return True if there was a run, and True if it is complete. A run that cannot be resumed raises
         :class:`InputError`.
         """
         with _signals_delayed():
@@ -96,7 +96,7 @@ class Recorder:
     def add_frame(self, time: float, state) -> None:
         """Record a frame ``time`` [s] after the start. With a GPU the next :meth:`write` writes it, while steps run.
 
-        The last substep has computed the moments. Before the first step they are solved, without effect on later steps.
+        The moments are those of the last substep. Before the first step they are solved, without effect on later steps.
         """
         self.write()
         if time > 0.0:

@@ -120,7 +120,7 @@ def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, art
 
 
 def _check_masses(builder: newton.ModelBuilder, stage, contents, bodies: dict[str, int]) -> None:
-    """Raise :class:`InputError` if a free body has a volume but no mass, for example an open mesh, and cannot move."""
+    """Raise :class:`InputError` if a free body cannot move: it has a volume but no mass, for example an open mesh."""
     for path in contents.bodies:
         free = path not in contents.kinematic
         if free and not builder.body_mass[bodies[path]] > 0.0 and has_volume(stage, path):
@@ -130,7 +130,7 @@ def _check_masses(builder: newton.ModelBuilder, stage, contents, bodies: dict[st
 def _copy_balls(
     builder: newton.ModelBuilder, stage, balls: IdenticalBalls, bodies, shapes_of_magnets, magnets: StageMagnets
 ) -> None:
-    """Copy the body, the shapes and the magnet of the first of identical balls for the other balls."""
+    """Copy the body, the shapes and the magnet of the first of several identical balls for the others."""
     first, others = balls.bodies()
     body = bodies[first]
     frames = BallFrames(stage, balls, np.array(builder.body_q[body], float)[3:])
@@ -148,22 +148,22 @@ def _copy_balls(
 
 
 def _correct_grounded_joint(
-    builder: newton.ModelBuilder, joint: GroundedJoint, number: int, body: int, shapes: dict[str, int]
+    builder: newton.ModelBuilder, joint: GroundedJoint, index: int, body: int, shapes: dict[str, int]
 ) -> None:
     """Correct Newton's import of a joint between a body and a fixed prim or the world.
 
-    Newton makes three assumptions: the fixed end is at the body's end, which is wrong for a distance joint; the frame
-    of a fixed prim is the world's; and ``body0`` is the fixed end.
+    Newton assumes that the fixed end is at the body's end, which is wrong for a distance joint. It also assumes that
+    the frame of a fixed prim is the world's, and that ``body0`` is the fixed end.
     """
-    kind = builder.joint_type[number]
+    kind = builder.joint_type[index]
     if joint.fixed or kind == newton.JointType.DISTANCE:
-        builder.joint_X_p[number] = wp.transform(joint.position, joint.rotation)
+        builder.joint_X_p[index] = wp.transform(joint.position, joint.rotation)
     if joint.reversed and kind in (newton.JointType.REVOLUTE, newton.JointType.PRISMATIC):
-        axis = builder.joint_qd_start[number]
+        axis = builder.joint_qd_start[index]
         lower, upper = builder.joint_limit_lower[axis], builder.joint_limit_upper[axis]
         builder.joint_limit_lower[axis], builder.joint_limit_upper[axis] = -upper, -lower
         builder.joint_target_qd[axis] *= -1.0
-        builder.joint_target_q[builder.joint_q_start[number]] *= -1.0
+        builder.joint_target_q[builder.joint_q_start[index]] *= -1.0
     if joint.fixed and not joint.collides:
         for prim, shape in shapes.items():
             if prim == joint.fixed or prim.startswith(f"{joint.fixed}/"):

@@ -38,15 +38,15 @@ DEFAULT_STEP = 1e-3
 LONGEST_SUBSTEP = 5e-4
 """Upper limit of a substep [s]. With it and XPBD's 60 iterations piles of 5 mm balls come to rest."""
 _OVERLAP = 1e-4
-"""Overlap at the start over the thickness above which a warning is issued."""
+"""Ratio of the initial overlap to the thickness above which a warning is issued."""
 _TOUCHING = 0.05
-"""Largest gap of touching bodies over their thickness, for the count of held bodies."""
+"""Largest ratio of gap to thickness of bodies that count as touching, for the number of held bodies."""
 _FRAME_RATE = 60.0
 """Output frame rate of a builder [Hz]."""
 _AHEAD = 16
 """Steps queued on a GPU before the host writes the last frame. Launches block with about 20 queued steps."""
 _STRONGEST_FIELD = 1e8
-"""Field, magnetization [A/m] or current [A] above which an error names it as the cause; ten times real maxima."""
+"""Field, magnetization [A/m] or current [A] above which an error names it as the cause: ten times practical maxima."""
 
 
 class Simulation:
@@ -373,7 +373,7 @@ class Simulation:
         return self.finish()
 
     def _run_frames(self, frames: int, recorder, on_frame: Callable[[int], bool | None] | None, resumed: bool) -> bool:
-        """Simulate and record, without the first frame if ``resumed``; return true if all frames are done."""
+        """Simulate and record, without the first frame if ``resumed``; return True if all frames are done."""
         statistics, before = self._statistics, self._statistics.wall_seconds
         began = time.perf_counter()
         try:
@@ -441,7 +441,7 @@ class Simulation:
         return statistics
 
     def _held_bodies(self) -> np.ndarray:
-        """Return true for each body that a magnet holds, shape [body_count]."""
+        """Return True for each body that a magnet holds, shape [body_count]."""
         model, contacts = self.model, self._solver.contacts
         shape_body = model.shape_body.numpy()
         # each static shape counts as a body, numbered after the bodies of the model

@@ -153,14 +153,14 @@ class Statistics:
 
 
 def find_held(pairs: np.ndarray, holders: np.ndarray, fixed: np.ndarray) -> np.ndarray:
-    """Return true for each body that a magnet holds, from the bodies that touch, shape [n, 2].
+    """Return True for each body that a magnet holds, from the bodies that touch, shape [n, 2].
 
-    A held body touches a holder, a permanent or fixed magnet. Or it touches a held body and does not stand on the
-    ground: bodies without magnets that are fixed in the world.
+    A held body touches a holder, a permanent or fixed magnet. Or it touches a held body and no ground. Ground is a
+    fixed body without magnets.
     """
 
     def neighbors(bodies: np.ndarray) -> np.ndarray:
-        """Return true for each body that touches one of ``bodies``."""
+        """Return True for each body that touches one of ``bodies``."""
         touched = np.zeros(len(fixed), dtype=bool)
         for first, second in (pairs.T, pairs.T[::-1]):
             touched[second[bodies[first]]] = True

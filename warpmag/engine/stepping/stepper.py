@@ -41,7 +41,7 @@ OVERLAP_LIMIT = 0.008
 _GROWTH_MARGIN = 0.8
 """The substep doubles when the predicted motion stays below this fraction of the limit."""
 _FUTILE_RATIO = 0.8
-"""If halved substeps leave more than this fraction of a penetration, shorter substeps are not tried."""
+"""Substeps are not halved again if halving left more than this fraction of a penetration."""
 _RECORDS = 64
 """Largest number of steps without :meth:`Stepper.read_reports`. On a CPU the host reads them after each step."""
 
@@ -384,7 +384,7 @@ def _arrays(state: newton.State | newton.Control) -> list[wp.array]:
 
 
 class _Clock:
-    """Measures the device's clock. :meth:`calibrate` sets the length ``seconds_per_tick`` of its tick."""
+    """Clock of a device. :meth:`calibrate` sets the duration ``seconds_per_tick`` of its tick."""
 
     def __init__(self, device):
         self._time = wp.zeros(1, dtype=wp.uint64, device=device)
