@@ -22,7 +22,7 @@ def summary(name: str) -> str:
 
 
 def make(name: str, folder: Path, balls: int | None = None) -> Path:
-    """Author a scene with a number of balls.
+    """Author a scene with a chosen number of balls.
 
     Args:
         name: A bundled scene, or one of :data:`MADE`.
@@ -33,12 +33,12 @@ def make(name: str, folder: Path, balls: int | None = None) -> Path:
         The file; its name contains the number.
 
     Raises:
-        InputError: The scene has no number of balls, the number is out of range, or the file cannot be written.
+        InputError: The scene has a fixed number of balls, the number is out of range, or the file cannot be written.
     """
     module = _module(name)
     parameter = inspect.signature(module.author).parameters.get("balls")
     if parameter is None:
-        raise InputError(f"balls: the scene {name} has no number of balls to choose")
+        raise InputError(f"balls: the scene {name} has a fixed number of balls")
     count = parameter.default if balls is None else balls
     path = folder / f"{name}_{count}.usdc"
     try:

@@ -58,8 +58,8 @@ def author(
     prim = authoring.add_box(stage, "/World/Magnet", (0.0, 0.0, 0.0), sizes, red, motion=authoring.KINEMATIC)
     _add_strengths(prim, {"strong": strong, "weak": weak}, strength)
     cells = [(x - 0.5 * (columns - 1), z - 0.5 * (rows - 1)) for z in range(rows) for x in range(columns)]
-    occupied = [(x, z) for x, z in cells if abs(x) > 0.5 * bar or abs(z) > 0.5 * bar_rows]
-    positions = [(x * spacing, 0.0, z * spacing) for x, z in occupied]
+    free_cells = [(x, z) for x, z in cells if abs(x) > 0.5 * bar or abs(z) > 0.5 * bar_rows]
+    positions = [(x * spacing, 0.0, z * spacing) for x, z in free_cells]
     options = {"motion": authoring.KINEMATIC, "magnet": Magnet(), "color": CRYSTAL_COLOR}
     authoring.add_ball_prims(stage, positions, radius, crystal, **options)
     reach = spacing * max(columns, 1.78 * rows)
@@ -72,7 +72,7 @@ def _check(columns, rows, bar, bar_rows, radius, spacing, strength) -> None:
         authoring.check_count(name, value)
     for name, value, total in (("bar", bar, columns), ("bar_rows", bar_rows, rows)):
         if value > total or (total - value) % 2:
-            raise InputError(f"{name}: must leave as many places on either side of {total}, got {value}")
+            raise InputError(f"{name}: must leave an even number of {total} cells, half on each side, got {value}")
     if spacing < authoring.BALL_SPACING * radius:
         raise InputError(f"spacing: balls of radius {radius:g} m would touch, got {spacing:g} m")
     if strength not in ("strong", "weak"):

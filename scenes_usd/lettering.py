@@ -32,7 +32,7 @@ class Box:
     angle: float  # rotation, counterclockwise [rad]
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Return whether each of ``points``, shape [n, 2], is inside, shape [n]."""
+        """Return True for each of ``points``, shape [n, 2], inside the box, shape [n]."""
         return np.max(np.abs(_rotated(points - self.center, -self.angle)) - self.half, axis=1) <= 0.0
 
 
@@ -68,7 +68,7 @@ def outline(letter: str, segments: int = 4) -> list[np.ndarray]:
 
 
 def area(curves: list[np.ndarray]) -> float:
-    """Return the area of an outline; clockwise curves, such as holes, count negative."""
+    """Return the area of an outline; clockwise curves, such as holes, count negatively."""
     pairs = [(curve, np.roll(curve, -1, axis=0)) for curve in curves]
     return sum(float(0.5 * np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])) for a, b in pairs)
 
@@ -140,7 +140,7 @@ def _directions(curves) -> np.ndarray:
 
 
 class _Grid:
-    """Cells over a letter in one direction: cells where boxes may lie, and cells that no box covers yet."""
+    """Cells over a letter in one direction, with marks where boxes may lie and where no box covers the letter yet."""
 
     def __init__(self, curves, angle):
         self._angle = angle
@@ -214,7 +214,7 @@ def _inset(curve, width) -> np.ndarray:
 
 
 def _inside(points, curves) -> np.ndarray:
-    """Return true for points, shape [n, 2], inside the curves: a ray to the right meets an odd number of edges."""
+    """Return True for points, shape [n, 2], inside the curves: a ray to the right meets an odd number of edges."""
     result = np.zeros(len(points), bool)
     x, y = points.T
     for curve in curves:

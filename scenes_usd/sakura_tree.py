@@ -119,7 +119,7 @@ def _add_tree(stage, tree, bark, bud, bud_radius, magnetization) -> None:
 
 
 def grow(branches: int, height: float, bud_radius: float, random: np.random.Generator) -> Tree:
-    """Grow a tree of a height [m] to at most ``branches`` random points of its crown; buds do not touch each other."""
+    """Grow a tree of ``height`` [m] to at most ``branches`` random points of its crown; its buds do not touch."""
     if not 0.0 < bud_radius < 0.5 * _STEP * height:
         raise InputError(f"bud_radius: must be positive and below {0.5 * _STEP * height:g} m, got {bud_radius:g}")
     targets = _crown(branches, random)
@@ -138,7 +138,7 @@ def grow(branches: int, height: float, bud_radius: float, random: np.random.Gene
                 nodes.append(new)
                 parents.append(int(node))
         if len(nodes) == count:
-            break  # points that pull a twig to and fro remain unreached
+            break  # points that pull a twig back and forth remain unreached
         distances = np.linalg.norm(targets[:, None] - nodes[count:], axis=2).min(axis=1)
         targets = targets[distances > _REACHED]
     nodes, parents = np.array(nodes), np.array(parents)
@@ -193,7 +193,7 @@ def _radii(parents, twig) -> np.ndarray:
 
 
 def rain(count: int, radius: float, spacing: float, height: float, random: np.random.Generator) -> np.ndarray:
-    """Return random centers of balls [m] above a tree of a height [m], from the lowest up, shape [count, 3].
+    """Return random centers of balls [m] above a tree of ``height`` [m], from the lowest up, shape [count, 3].
 
     ``spacing`` is the edge of the mean volume per ball [m].
     """

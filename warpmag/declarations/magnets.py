@@ -40,10 +40,7 @@ SATURATION_OF_IRON = 1.7e6
 
 
 def check_curve(name: str, value: Any, materials: tuple[str, ...] = ()) -> None:
-    """Raise :class:`InputError` unless ``value`` is a measured curve or in :data:`CURVES`.
-
-    The message lists ``CURVES`` and the names of ``materials`` with a measured curve.
-    """
+    """Raise :class:`InputError` unless ``value`` is a measured curve or in ``CURVES``, listed with ``materials``."""
     if not isinstance(value, MagnetizationCurve) and not (isinstance(value, str) and value in CURVES):
         check_token(name, value, (*CURVES, *materials))
 

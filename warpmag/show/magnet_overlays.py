@@ -146,7 +146,7 @@ def trace(field: _Function, ends: _Function, seeds: np.ndarray, size: float) -> 
 
     Args:
         field: Function that returns the field at points, shape [k, 3]; a line ends where the field is zero.
-        ends: Function that returns whether a line ends at points, shape [k].
+        ends: Function that returns True where a line ends at points, shape [k].
         seeds: First points of the lines, shape [k, 3].
         size: Size that the length of steps is proportional to.
 

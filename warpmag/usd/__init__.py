@@ -1,7 +1,7 @@
 """Reads and writes USD: schemas of magnets, stages and their errors, and the cache of a run.
 
-Only this folder and ``show`` import ``pxr``. Importing it registers the schemas of warpmag and Newton. Do so before the
-first stage is opened in a process, because USD takes no new schemas afterwards; warpmag reads its own attributes
+Only this folder and ``show`` import ``pxr``. Importing this package registers the schemas of warpmag and Newton. Import
+it before a process opens the first stage, because USD takes no new schemas afterwards. warpmag reads its own attributes
 correctly even then. May import ``declarations``.
 """
 

@@ -96,7 +96,7 @@ def author(prim: Usd.Prim, attribute: Attribute, value: Any) -> None:
 
 
 def read_fields(prim: Usd.Prim, attributes: Iterable[Attribute]) -> dict[str, Any]:
-    """Return the values of attributes of ``prim`` by field, as far as they have one; check only their types."""
+    """Return the values of those attributes of ``prim`` that have a value, by field; only types are checked."""
     values = {}
     for row in attributes:
         attribute = prim.GetAttribute(row.usd_name)
@@ -140,7 +140,7 @@ class ColliderMagnet:
 
 
 def collider_magnet(collider: Usd.Prim) -> ColliderMagnet | None:
-    """Return the magnet of a collider, None where the collider is no magnet; see :func:`magnet_of` for errors."""
+    """Return the magnet of a collider, None if the collider is not a magnet; see :func:`magnet_of` for errors."""
     prim = _magnet_prim(collider)
     if prim is None:
         return None
@@ -221,5 +221,5 @@ def finite_vector(name: str, value) -> tuple[float, float, float]:
 
 
 def has_api(prim: Usd.Prim, name: str) -> bool:
-    """Return whether the API schema ``name`` is applied to ``prim``, even if registered after the first stage."""
+    """Return True if the API schema ``name`` is applied to ``prim``, even if USD registered it too late."""
     return name in prim.GetPrimTypeInfo().GetAppliedAPISchemas()

@@ -159,7 +159,7 @@ def attribute_findings(prim: Usd.Prim, *, shape: bool) -> Iterator[Finding]:
 
 
 def declaration_findings(scene: Usd.Prim) -> Iterator[Finding]:
-    """Yield findings about ``newton`` properties of a scene in no schema: Newton reads them as declarations."""
+    """Yield findings about ``newton:`` properties of a scene without a schema: Newton reads them as declarations."""
     path = str(scene.GetPath())
     known = {*scene.GetPrimDefinition().GetPropertyNames(), *_newton_attributes(), *_SCENE_OPTIONS}
     for attribute in scene.GetAuthoredPropertiesInNamespace("newton"):
@@ -212,21 +212,21 @@ def vector(name: str, value) -> tuple[float, float, float]:
 
 
 def text(name: str, value) -> str:
-    """Return a token or a string."""
+    """Return ``value`` if it is a token or a string."""
     if not isinstance(value, str):
         raise InputError(f"{name}: {_shown(value)} is not a str")
     return value
 
 
 def flag(name: str, value) -> bool:
-    """Return true or false."""
+    """Return ``value`` if it is a bool."""
     if not isinstance(value, bool):
         raise InputError(f"{name}: must be true or false, got {value!r:.60}")
     return value
 
 
 def whole_numbers(name: str, value) -> tuple[int, int, int]:
-    """Return three whole numbers."""
+    """Return the components of a vector of whole numbers."""
     if not isinstance(value, Gf.Vec3i):
         raise InputError(f"{name}: must be three whole numbers, got {value!r:.60}")
     x, y, z = value
@@ -300,7 +300,7 @@ def _check_numbers(prim, name, value, fallback) -> None:
 
 
 def _broken_condition(name, value) -> str:
-    """Return the condition that the numbers of a value break together, empty where they break none."""
+    """Return the condition that the numbers of a value violate together, empty where they violate none."""
     if name in _QUATERNIONS:
         norm = float(np.linalg.norm(_numbers(value)))
         if abs(norm - 1.0) > 1e-2 and not (norm == 0.0 and name == "physics:principalAxes"):

@@ -25,7 +25,7 @@ class BallInstancer:
         frames: Transforms of the balls of each group.
         bodies: Path of each ball, in the order of the arrays.
         magnets: Path of the magnet of each ball, None for a ball without a magnet, shape [n].
-        permanent: Whether the magnet is permanent, shape [n].
+        permanent: True for each ball with a permanent magnet, shape [n].
     """
 
     def __init__(self, stage: Usd.Stage, groups: Sequence[IdenticalBalls]):

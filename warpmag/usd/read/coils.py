@@ -53,7 +53,7 @@ def author_field_map(prim: Usd.Prim, field_map: FieldMap) -> None:
 
 
 def is_source(prim: Usd.Prim) -> bool:
-    """Return whether a prim is a coil or a field map."""
+    """Return True if a prim is a coil or a field map."""
     return has_api(prim, COIL_SCHEMA.name) or has_api(prim, FIELD_MAP_SCHEMA.name)
 
 
@@ -133,7 +133,7 @@ def _read(prim: Usd.Prim, schema: Schema) -> dict:
     for row in schema.attributes:
         if not (attribute := prim.GetAttribute(row.usd_name)):
             continue
-        specs = attribute.GetPropertyStack()  # those below a frozen value too
+        specs = attribute.GetPropertyStack()  # including specs below a frozen value
         if row.uniform and any(spec.layer.GetNumTimeSamplesForPath(spec.path) > 1 for spec in specs):
             raise InputError(f"{prim.GetPath()}: {row.usd_name} has time samples, but cannot change")
         if finding := instance_finding(attribute):

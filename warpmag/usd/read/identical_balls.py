@@ -33,8 +33,8 @@ _SIMILARITY = 1e-6
 class IdenticalBalls:
     """Instances of one instancer that differ only in the values of its arrays.
 
-    A run writes the instancer as an instancer, ``stays_instancer``, if it is large and all its instances are identical
-    balls.
+    ``stays_instancer`` means that a run writes the instancer as an instancer: it is large, and all its instances are
+    identical balls.
     """
 
     first: Sdf.Path  # of the instance that has prims
@@ -104,7 +104,8 @@ class BallFrames:
     def velocities(self, arrays: dict[str, np.ndarray], first: np.ndarray | None = None) -> np.ndarray:
         """Return linear [m/s] and angular velocities [rad/s] of the bodies in the world, shape [n, 6].
 
-        Where the arrays have none, each body has those of the ``first``, shape [6], by default zero, in its own frame.
+        Without velocities in the arrays, each body has the velocities ``first`` of the first body, shape [6], rotated
+        with the body; by default zero.
         """
         linear, angular = arrays["velocities"], np.radians(arrays["angularVelocities"])
         rotations = self._rotations(arrays)
@@ -186,7 +187,7 @@ def identical_balls(
 
 
 def _has_interchangeable_instances(stage: Usd.Stage, instancer: UsdGeom.PointInstancer, time_code: float) -> bool:
-    """Return whether no prim can refer to a single instance, and the scale of the instancer is uniform."""
+    """Return True if no prim can refer to a single instance, and the scale of the instancer is uniform."""
     path = instancer.GetPath()
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
         if any(map(prim.IsA, _REFERRING)) or prim.HasAPI(UsdPhysics.FilteredPairsAPI):
@@ -202,7 +203,7 @@ def _has_interchangeable_instances(stage: Usd.Stage, instancer: UsdGeom.PointIns
 
 
 def _can_stay_instancer(instancer: UsdGeom.PointInstancer, time_code: float) -> bool:
-    """Return whether nothing else moves or scales an instancer, and scales and prototypes are constant."""
+    """Return True if nothing else moves or scales an instancer, and scales and prototypes are constant."""
     prim = instancer.GetPrim()
     if instancer.GetAccelerationsAttr().HasAuthoredValue():
         return False
@@ -229,7 +230,7 @@ def _ball_in(prototype: Usd.Prim) -> Sdf.Path | None:
 
 
 def _can_be_copied(prim: Usd.Prim) -> bool:
-    """Return whether a prim has no time samples and refers to no other prim, except for a material."""
+    """Return True if a prim has no time samples and refers to no other prim, except for a material."""
     schemas = prim.GetPrimTypeInfo().GetAppliedAPISchemas()
     sampled = any(attribute.GetNumTimeSamples() or attribute.HasSpline() for attribute in prim.GetAttributes())
     return _SCHEMAS.issuperset(schemas) and not sampled and not prim.IsInstanceProxy() and not prim.IsInstance()

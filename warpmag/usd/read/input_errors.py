@@ -39,7 +39,7 @@ def newton_errors(stage_name: str, action: str) -> Iterator[None]:
             yield
     except InputError:
         raise
-    except Exception as error:  # of any kind: no traceback of Newton or Warp is to reach the user
+    except Exception as error:  # of any kind: users see no traceback of Newton or Warp
         message = first_line(error) if isinstance(error, Tf.ErrorException) else one_line_of(error)
         raise InputError(f"{stage_name}: Newton cannot {action} it ({message or type(error).__name__})") from None
     for message in (*(one_line_of(warning.message) for warning in caught), *logged):

@@ -148,7 +148,7 @@ class _Expansion:
         write([row for row in instances.rows if row not in deferred])
 
     def _follows_keys(self, target: Sdf.Path) -> bool:
-        """Return whether a prototype has kinematic bodies or colliders without a body, which follow the instance."""
+        """Return True if a prototype has kinematic bodies or colliders without a body, which follow the instance."""
         dynamic = False
         for prim in descendants(self._stage.GetPrimAtPath(target)):
             if is_body(prim):

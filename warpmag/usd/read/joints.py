@@ -125,11 +125,11 @@ def prepare_joints(stage: Usd.Stage, *, articulations: bool = True) -> list[Grou
     for path in [joint.GetPath() for joint in enabled_joints(stage)]:
         joint = UsdPhysics.Joint.Get(stage, path)
         ends, axes = _ends(stage, joint), _free_axes(joint.GetPrim())
-        still = [number for number, end in enumerate(ends) if not end.moves]
-        if (still == [0] and not ends[0].body) or still == [1]:
-            grounded.append(_grounded(joint, ends, still[0]))
-        swapped = still == [1] and ends[1].body is not None
-        if not (axes or swapped or len(still) == 2):
+        fixed_ends = [number for number, end in enumerate(ends) if not end.moves]
+        if (fixed_ends == [0] and not ends[0].body) or fixed_ends == [1]:
+            grounded.append(_grounded(joint, ends, fixed_ends[0]))
+        swapped = fixed_ends == [1] and ends[1].body is not None
+        if not (axes or swapped or len(fixed_ends) == 2):
             continue
         with Usd.EditContext(stage, stage.GetSessionLayer()):
             joint = UsdPhysics.Joint(_editable(stage, path))
@@ -137,9 +137,9 @@ def prepare_joints(stage: Usd.Stage, *, articulations: bool = True) -> list[Grou
                 limit = UsdPhysics.LimitAPI.Apply(joint.GetPrim(), axis)
                 limit.CreateLowAttr(-math.inf)
                 limit.CreateHighAttr(math.inf)
-            if swapped:  # Newton drops the joint; with a target that is no body it uses the world
+            if swapped:  # Newton would drop the joint; a target that is not a body makes it use the world
                 joint.GetBody1Rel().SetTargets([path])
-            if len(still) == 2:
+            if len(fixed_ends) == 2:
                 joint.GetJointEnabledAttr().Set(False)
     return grounded
 
@@ -198,11 +198,11 @@ def _ends(stage, joint) -> list[_End]:
     return ends
 
 
-def _grounded(joint, ends, still: int) -> GroundedJoint:
-    """Return a joint with the world frame of its fixed end, number ``still``."""
-    local_position = (joint.GetLocalPos0Attr, joint.GetLocalPos1Attr)[still]().Get()
-    local_rotation = Gf.Quatd((joint.GetLocalRot0Attr, joint.GetLocalRot1Attr)[still]().Get()).GetNormalized()
-    fixed = ends[still].prim
+def _grounded(joint, ends, fixed_end: int) -> GroundedJoint:
+    """Return a joint with the world frame of its fixed end, 0 or 1."""
+    local_position = (joint.GetLocalPos0Attr, joint.GetLocalPos1Attr)[fixed_end]().Get()
+    local_rotation = Gf.Quatd((joint.GetLocalRot0Attr, joint.GetLocalRot1Attr)[fixed_end]().Get()).GetNormalized()
+    fixed = ends[fixed_end].prim
     world = UsdGeom.XformCache(Usd.TimeCode.Default()).GetLocalToWorldTransform(fixed) if fixed else Gf.Matrix4d(1.0)
     position = world.Transform(Gf.Vec3d(local_position))
     rotation = Gf.Transform(world).GetRotation().GetQuat() * local_rotation
@@ -211,7 +211,7 @@ def _grounded(joint, ends, still: int) -> GroundedJoint:
         tuple(position),
         (*rotation.GetImaginary(), rotation.GetReal()),
         str(fixed.GetPath()) if fixed else "",
-        str(ends[1 - still].body.GetPath()),
-        still == 1,
+        str(ends[1 - fixed_end].body.GetPath()),
+        fixed_end == 1,
         bool(joint.GetCollisionEnabledAttr().Get()),
     )

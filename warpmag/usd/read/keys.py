@@ -36,7 +36,7 @@ class KeyReader:
         return without_frozen(self._stage)
 
     def moves(self, prim: Usd.Prim, within: Usd.Prim | None = None) -> bool:
-        """Return whether keys move a prim or a parent, in the world or relative to the parent ``within``."""
+        """Return True if keys move a prim or a parent, in the world or relative to the parent ``within``."""
         for parent in lineage(prim):
             if parent == within:
                 return False
@@ -92,7 +92,7 @@ class KeyReader:
                 return
 
     def _varies(self, path: Sdf.Path) -> bool:
-        """Return whether the prim's own transform differs between its samples."""
+        """Return True if the prim's own transform differs between its samples."""
         for op in UsdGeom.Xformable(self.unfrozen.GetPrimAtPath(path)).GetOrderedXformOps():
             if op.GetAttr().HasSpline():
                 return True
@@ -188,7 +188,7 @@ def _operation(xform: UsdGeom.XformOp) -> Operation:
 
 
 def _is_identity(operation: Operation) -> bool:
-    """Return whether an operation is the identity at all keys."""
+    """Return True if an operation is the identity at all keys."""
     neutral = {"translate": np.zeros(3), "scale": np.ones(3), "matrix": np.eye(4).ravel()}.get(operation.kind)
     return neutral is not None and bool((operation.keys.values == neutral).all())
 

@@ -57,7 +57,7 @@ def _apply_mass(prim) -> UsdPhysics.MassAPI:
 
 
 def _has_mass(prim) -> bool:
-    """Return whether a prim has a mass or a density; in USD zero means none."""
+    """Return True if a prim has a mass or a density; in USD zero means none."""
     mass = UsdPhysics.MassAPI(prim)
     return prim.HasAPI(UsdPhysics.MassAPI) and bool(mass.GetMassAttr().Get() or mass.GetDensityAttr().Get())
 

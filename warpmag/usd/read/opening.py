@@ -135,7 +135,7 @@ def freeze(stage: Usd.Stage, time_code: float) -> None:
 
 
 def _unfreeze(attribute: Usd.Attribute, session: Sdf.Layer) -> bool:
-    """Remove the value of an earlier :func:`freeze`; return whether the attribute has time samples or a spline."""
+    """Remove the value of an earlier :func:`freeze`; return True if the attribute has time samples or a spline."""
     spec = session.GetAttributeAtPath(attribute.GetPath())
     value = spec.default if spec else None
     if spec:

@@ -11,28 +11,28 @@ _SOLIDS = (
 
 
 def is_body(prim: Usd.Prim) -> bool:
-    """Return whether a prim is an enabled rigid body."""
+    """Return True if a prim is an enabled rigid body."""
     return prim.HasAPI(UsdPhysics.RigidBodyAPI) and bool(UsdPhysics.RigidBodyAPI(prim).GetRigidBodyEnabledAttr().Get())
 
 
 def is_collider(prim: Usd.Prim) -> bool:
-    """Return whether a prim is an enabled collider."""
+    """Return True if a prim is an enabled collider."""
     return prim.HasAPI(UsdPhysics.CollisionAPI) and bool(UsdPhysics.CollisionAPI(prim).GetCollisionEnabledAttr().Get())
 
 
 def is_physical(prim: Usd.Prim) -> bool:
-    """Return whether a prim has a schema of a body, a collider, a magnet or a field source."""
+    """Return True if a prim has a schema of a body, a collider, a magnet or a field source."""
     schemas = prim.GetPrimTypeInfo().GetAppliedAPISchemas()
     return any(name.startswith(("PhysicsRigidBody", "PhysicsCollision", "Warpmag")) for name in schemas)
 
 
 def is_solid(prim: Usd.Prim) -> bool:
-    """Return whether a prim is of a type that has a volume."""
+    """Return True if a prim is of a type that has a volume."""
     return any(prim.IsA(kind) for kind in _SOLIDS)
 
 
 def has_volume(stage: Usd.Stage, body: str) -> bool:
-    """Return whether a rigid body has a collider of a type that has a volume."""
+    """Return True if a rigid body has a collider of a type that has a volume."""
     return any(is_collider(prim) and is_solid(prim) for prim in prims_of_magnet(stage.GetPrimAtPath(body)))
 
 

@@ -178,7 +178,7 @@ class Playback:
         self._stage, self._instancers = stage, instancers
 
     def seek(self, time_code: float) -> None:
-        """Go to a time code."""
+        """Set the time code that the other methods read."""
         freeze(self._stage, time_code)
 
     def poses(self, prims: Sequence[str]) -> np.ndarray:

@@ -27,7 +27,7 @@ def add_layer(stage: Usd.Stage, name: str) -> Sdf.Layer:
 
 
 def added_layer(stage: Usd.Stage, name: str) -> Sdf.Layer | None:
-    """Return the added layer with a name, None where there is none."""
+    """Return the added layer ``name``, None where there is none."""
     layers = (Sdf.Layer.Find(path) for path in stage.GetSessionLayer().subLayerPaths)
     return next((layer for layer in layers if layer and layer.GetDisplayName() == f"{name}.usda"), None)
 
@@ -43,7 +43,7 @@ def release_instances(stage: Usd.Stage, layer: Sdf.Layer, within: Sdf.Path) -> N
 
 
 def release(stage: Usd.Stage, layer: Sdf.Layer, instances: list[Sdf.Path]) -> None:
-    """Make instances editable, by opinions in ``layer``; raise :class:`InputError` if a physical one may change."""
+    """Make instances editable in ``layer``; raise :class:`InputError` if that applies an override to a physical one."""
     with Sdf.ChangeBlock():
         for path in instances:
             Sdf.CreatePrimInLayer(layer, path).instanceable = False

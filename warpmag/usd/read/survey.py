@@ -162,9 +162,9 @@ def _read_magnet(prim, transforms, keys, contents) -> None:
         contents.findings.append(Finding(path, f"its rigid body {owner.GetPath()} is a magnet already"))
     try:
         contents.magnets[path] = magnet = magnet_of(prim)
-        if curve := magnetization_keys(prim, magnet, keys):
-            contents.magnetization_keys[path] = curve
-        contents.findings += kind_findings(prim, magnet, keyed=curve is not None)
+        if magnet_keys := magnetization_keys(prim, magnet, keys):
+            contents.magnetization_keys[path] = magnet_keys
+        contents.findings += kind_findings(prim, magnet, keyed=magnet_keys is not None)
         if moment := moment_of(prim):
             contents.initial_moments[path] = moment
     except InputError as error:

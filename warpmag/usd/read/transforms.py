@@ -16,7 +16,7 @@ SCALE_TOLERANCE = 1e-5
 
 
 def is_animated(prim: Usd.Prim) -> bool:
-    """Return whether any layer has time samples or a spline for the prim's own transform, frozen or not."""
+    """Return True if any layer has time samples or a spline for the prim's own transform, frozen or not."""
     if not prim.IsA(UsdGeom.Xformable):
         return False
     try:
@@ -84,7 +84,7 @@ class TransformCheck:
             yield Finding(path, "a sphere with non-uniform scale would be imported as a ball: make it a mesh")
 
     def is_valid(self, prim: Usd.Prim) -> bool:
-        """Return whether :meth:`findings` was called for a prim, and USD can compose its transform."""
+        """Return True if :meth:`findings` was called for a prim, and USD can compose its transform."""
         return self._valid.get(prim.GetPath(), False)
 
     def _lineage_findings(self, prim) -> Iterator[Finding]:

@@ -15,7 +15,7 @@ import sys
 from itertools import accumulate, islice
 
 MOST_PRIMS, DEEPEST_NESTING = 500_000, 5_000
-"""Most prims of a stage, and levels of brackets in a text: USD reads 10,000 levels, and crashes at 100,000."""
+"""Largest numbers of prims in a stage and of bracket levels in a text: USD reads 10,000 levels, crashes at 100,000."""
 _SECONDS, _BYTES_PER_SECOND = 30.0, 5e6
 """Least limit of the child's CPU time [s], and bytes of the stage and its files that add a second to it."""
 _ARCS = re.compile(rb"@|references|payload|inherits|specializes|prototypes")

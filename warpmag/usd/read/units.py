@@ -1,10 +1,10 @@
 """Converts stages in other units than meters and kilograms to SI units, in a layer over the unchanged scene.
 
 Newton's importer converts no units. Every value with a length or a mass in its unit is therefore written in SI units to
-a layer of the session: defaults, time samples, and fallback values of shapes: a sphere without an authored radius
-has a radius of one unit. Angles are always in degrees and times in seconds. Lengths of warpmag's attributes are in the
-unit of the stage, like those of shapes. Magnetizations, fields, currents and moments are always SI, because USD has no
-unit of current and data sheets use A/m.
+a layer of the session: defaults, time samples, and fallback values of shapes. A sphere without an authored radius, for
+example, has a radius of one unit. Angles are always in degrees and times in seconds. Lengths of warpmag's attributes
+are in the unit of the stage, like those of shapes. Magnetizations, fields, currents and moments are always SI, because
+USD has no unit of current and data sheets use A/m.
 """
 
 import math

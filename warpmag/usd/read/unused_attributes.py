@@ -15,7 +15,7 @@ from warpmag.usd.values import Finding
 _SCHEMA_NAMES = [schema.name for schema in SCHEMAS]
 _SCHEMA_OF = {row.usd_name: schema.name for schema in SCHEMAS for row in schema.attributes}
 _SIMILAR = 0.85
-"""Least similarity of a misspelled name and the right one: one wrong letter in seven, or two swapped letters."""
+"""Least similarity of a misspelled and a correct name: one wrong letter in seven, or two swapped letters."""
 
 
 def stray_findings(prim: Usd.Prim) -> Iterator[Finding]:
@@ -53,7 +53,7 @@ def kind_findings(prim: Usd.Prim, magnet: Magnet, *, keyed: bool) -> Iterator[Fi
 
 @functools.cache  # thousands of prims have the same few names
 def _is_similar(name: str, known: Collection[str]) -> bool:
-    """Return whether a name is one of the known names, or may be a misspelling of one."""
+    """Return True if a name is one of the known names, or may be a misspelling of one."""
     return any(difflib.SequenceMatcher(None, name.lower(), other.lower()).ratio() >= _SIMILAR for other in known)
 
 

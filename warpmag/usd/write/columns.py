@@ -1,6 +1,6 @@
 """Attributes that a run writes in each frame.
 
-A frame is one block of bytes, the values of all attributes as they lie in a crate file: one value for each prim that
+A frame is one block of bytes, the values of all attributes in the layout of a crate file: one value for each prim that
 has the attribute, or an array with its length in front.
 """
 

@@ -61,7 +61,7 @@ class OverLayer:
     """
 
     def __init__(self, sizes: np.ndarray):
-        """Create an empty layer; ``sizes`` are those of a value of each sampled attribute [bytes]."""
+        """Create an empty layer; ``sizes`` holds the size of a value of each sampled attribute [bytes]."""
         self._sizes = sizes
         self._types, self._type_fields = list[int](), list[int]()
         self._tokens, self._strings = {";-)": 0}, dict[int, int]()  # properties are negative tokens, so none may be 0
@@ -74,7 +74,7 @@ class OverLayer:
         self._editable, self._vectors = set[str](), dict[tuple[int, ...], int]()
 
     def set_metadata(self, name: str, value: float | str | dict) -> None:
-        """Set metadata of the layer; texts become tokens, in dictionaries strings."""
+        """Set metadata of the layer; texts become tokens, but strings in dictionaries."""
         if isinstance(value, str):
             value_reference = self._token_reference(value)
         elif isinstance(value, dict):

@@ -27,7 +27,7 @@ class Placements:
     Attributes:
         paths: Paths of the bodies.
         scales: Scale of each body relative to its parent, shape [n, 3].
-        resets: Whether each body must ignore its parent's transform (``!resetXformStack!``), shape [n].
+        resets: True for each body that must ignore its parent's transform (``!resetXformStack!``), shape [n].
     """
 
     def __init__(self, stage: Usd.Stage, paths: Sequence[str], unit: float = 1.0):
@@ -72,7 +72,7 @@ class Placements:
         """Return the attributes of the bodies in one frame, see :meth:`CacheWriter.add_frame`.
 
         Each quaternion gets the sign closer to that of the previous frame, ``last_rotations``, so that interpolation
-        takes the short way.
+        takes the shorter arc.
         """
         # column-major arrays halve the time
         positions, rotations = (values.astype(np.float64, order="F") for values in (body_q[:, :3], body_q[:, 3:]))

@@ -30,9 +30,9 @@ from warpmag.errors import InputError
 from warpmag.usd.write.crate import CONTENTS, DOUBLE_VECTOR, HEAD, MAGIC, SECTION, SECTION_NAME, LayerFile, reference
 
 _AHEAD = 512
-"""References written to a row in advance: one page of the file. Each frame writes those of some rows."""
+"""References written to a row in advance: one page of the file. Each frame writes them to some of the rows."""
 _FIRST_AHEAD = 64
-"""The same where all rows are written at once; smaller, to keep the first frame short."""
+"""The same where all rows are written at once; smaller, to save time in the first frame."""
 _BLOCK = 1 << 17
 """References in memory at once."""
 _FIRST_CAPACITY = 64
@@ -70,7 +70,7 @@ class SampleFile:
     def begin(cls, path: str | os.PathLike, layer: LayerFile, sizes: np.ndarray, frames: int | None) -> "SampleFile":
         """Create a file, which must not exist, with a layer and space for the expected number of frames.
 
-        ``sizes`` are those of a value of each attribute [bytes], in the order of a frame, shape [attributes].
+        ``sizes`` holds the size of each attribute's value [bytes], in the order of a frame, shape [attributes].
         """
         with contextlib.ExitStack() as stack:
             file = stack.enter_context(open(path, "x+b", buffering=0))
@@ -181,7 +181,7 @@ class SampleFile:
             raise
 
     def _is_intact(self) -> bool:
-        """Return whether the file has its full size and contains the frames of the checkpoint."""
+        """Return True if the file has its full size and contains the frames of the checkpoint."""
         places, descriptor = self._places, self._file.fileno()
         if os.fstat(descriptor).st_size < places.size:
             return False
@@ -214,9 +214,9 @@ class SampleFile:
             places.filled, self._ahead = last, 0
 
     def _fill_rows(self, first: int, last: int, begin: int, end: int) -> None:
-        """Write references of frames, which may not exist yet, to rows; in front of frame 0 the number of samples.
+        """Write references of frames, which may not exist yet, to rows. The number of samples precedes frame 0.
 
-        The frames are from ``first`` to ``last - 1``, the rows from ``begin`` to ``end - 1``.
+        The frames are ``first`` to ``last - 1``, the rows ``begin`` to ``end - 1``.
         """
         frames = self._frame_places(first, last)
         block = max(1, _BLOCK // max(1, last - first))
@@ -234,7 +234,7 @@ class SampleFile:
                 self._write(row + inside, data[number * size : (number + 1) * size])
 
     def _write_heads(self, first: int, last: int) -> None:
-        """Write the heads of attributes: the times, or the empty list without samples, and the rows."""
+        """Write the heads of attributes: references to the times (without samples to the empty list) and the rows."""
         places = self._places
         heads = np.full((last - first, HEAD // 8), 8, dtype=np.int64)
         times = np.where(places.sampled[first:last], places.times, places.times - 8)  # the empty list

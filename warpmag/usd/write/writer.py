@@ -167,7 +167,7 @@ class CacheWriter:
         return PreviousRun(self._last_time, state)
 
     def _completed(self) -> PreviousRun:
-        """Return a complete run, which has left no checkpoint."""
+        """Return a complete run, which has no checkpoint."""
         path = self._output.cache
         with usd_errors(str(path)):
             cache = Sdf.Layer.OpenAsAnonymous(str(path)) if path.exists() else None
@@ -347,7 +347,7 @@ class CacheWriter:
         root = Sdf.Layer.CreateAnonymous()
         for key in copied_metadata(scene):
             root.pseudoRoot.SetInfo(key, scene.pseudoRoot.GetInfo(key))
-        # Players stop at whole frames. The last frame stands at its nearest step, perhaps later, and must be shown.
+        # Players stop at whole frames. The last frame is at the nearest step, which may be later, and must be shown.
         last_frame = round(self._last_time * self._clock.frames_per_second) / self._clock.frames_per_second
         for key, value in self._metadata(self._code(max(last_frame, self._last_time))).items():
             root.pseudoRoot.SetInfo(key, value)
