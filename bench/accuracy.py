@@ -10,7 +10,7 @@ Each error has its own reference:
 | clusters | forces and moments of three balls in a row and of thirteen balls | ``bench.reference.clusters`` |
 | time step | energy of two balls that fall towards each other | conservation |
 | boxes | forces of two box magnets | ``bench.reference.magnet_pairs`` |
-| price | time of the near-contact model in a touching pile | dipoles alone |
+| price | time of the near-contact model in a touching pile | time with dipoles alone |
 | arrangements | magnetizations of many arrangements, and the estimate of the solve | a float64 Newton solution |
 
 Prints a table of each error, or of the named ones, and writes ``accuracy.jsonl``, and ``accuracy.png`` for all errors.

@@ -12,7 +12,7 @@ SATURATION = 1.7e6  # saturation magnetization of every case [A/m]
 class Case:
     """One benchmark."""
 
-    name: str  # on the command line
+    name: str  # its name on the command line
     summary: str  # quantity that is timed
     sizes: dict[str, tuple[int, ...]]  # numbers of balls on a CPU and on a GPU
     dtypes: tuple[str, ...] = ("float32",)

@@ -117,11 +117,11 @@ def run_size(count: int, device, slowest: float, seconds: dict):
             work()
             wp.synchronize_device(device)
             first = time.perf_counter() - began
-            taken = measure(work, device, **repetitions(count))
+            elapsed = measure(work, device, **repetitions(count))
             if rtol is None:
-                seconds[quantity, count] = taken
+                seconds[quantity, count] = elapsed
             line = {"quantity": quantity.name.lower(), "method": "direct" if rtol is None else "fmm", "rtol": rtol}
-            line |= {"count": count, "seconds": taken, **errors(single.out.numpy()[rows], expected)}
+            line |= {"count": count, "seconds": elapsed, **errors(single.out.numpy()[rows], expected)}
             yield line | {"first_call_seconds": first}
 
 

@@ -56,7 +56,7 @@ def main() -> None:
     wp.config.log_level = wp.LOG_WARNING
     all_ranks, device = current_ranks(), resolve_device(None)
     if all_ranks is None or not device.is_cuda:
-        parser.error("to be started by mpirun, with a GPU for each rank")
+        parser.error("start it by mpirun, with a GPU for each rank")
     write = line_writer(device)
     for count, rtol in CASES:
         for quantity in (Quantity.FIELD, Quantity.WRENCH):

@@ -17,7 +17,7 @@ from warpmag.engine.pile_xpbd.capture import without_allocations
 from warpmag.scenes_usd import balls_up, bundled
 
 _SETTLING, _STEPS = 32, 60  # steps before the measurement, in which the balls start to move, and measured steps
-_AHEAD = 10  # steps that the host may be ahead of the device: beyond about 20 graphs a GPU makes the host wait
+_AHEAD = 10  # steps that the host may be ahead of the device: with more than about 20 graphs a GPU blocks the host
 
 
 def run_scene(count: int, device) -> dict:

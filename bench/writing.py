@@ -90,7 +90,7 @@ def run_swarm(count: int, device, frames: int | None = None) -> dict:
 
 
 def _write_swarm(simulation: Simulation, output: Path, frames: int) -> tuple[float, list[float]]:
-    """Write frames of moving balls; return the seconds taken, and the memory after each frame [MB]."""
+    """Write frames of moving balls; return the time of writing [s], and the memory after each frame [MB]."""
     rng, memory, seconds = np.random.default_rng(0), [], -time.perf_counter()
     recorder: Recorder = simulation._open_recorder(output, False, frames)
     seconds += time.perf_counter()

@@ -284,7 +284,15 @@ SYSTEMS = {
 
 
 EXPECTED = {
-    "balls": {"sum_and_finish", "begin_flow", "sweep", "check_convergence", "advance", "brake", "eddy_passes"},
+    "balls": {
+        "sum_and_finish",
+        "begin_flow",
+        "sweep",
+        "check_convergence",
+        "advance",
+        "add_eddy_moments",
+        "eddy_passes",
+    },
     "paper": {"sum_and_finish", "begin_worlds", "step_pairs", "check_convergence", "zeeman_moments"},
     "gilbert": {"sum_and_finish", "begin_worlds", "step_pairs", "check_convergence"},
     "near": {"sum_tile", "make_passes", "begin_flow"},
@@ -292,8 +300,8 @@ EXPECTED = {
     "yielding": {"sum_tile", "finish", "begin_flow", "add_bias"},
     "cells": {"sum_and_finish", "add_couplings", "sweep"},
     "whole": {"sum_and_finish", "add_couplings", "respond_all"},
-    "coils": {"sum_tile", "apply_sources", "add_forces", "add_to_probe", "brake"},
-    "solids": {"sum_and_finish", "apply_sources", "add_forces", "add_to_probe", "brake"},
+    "coils": {"sum_tile", "apply_sources", "add_forces", "add_to_probe", "add_eddy_moments"},
+    "solids": {"sum_and_finish", "apply_sources", "add_forces", "add_to_probe", "add_eddy_moments"},
     "fast": {"build_octree", "sum_leaf", "translate_block", "add_parts", "expansion_step", "return_sums"},
     "most": {"sum_mirrored", "finish", "sweep", "list_neighbors"},
 }

@@ -153,9 +153,9 @@ def test_a_part_of_a_section_stays_when_another_is_measured(tmp_path):
     assert at == sorted(at) and "old" not in report
 
 
-def test_a_trial_ends_with_patience(device):
+def test_a_trial_ends_at_its_time_limit(device):
     """What is left is a row: however slow the method, a step was done and timed."""
-    values = run_trial(Trial("balls_up", "kim2018", seconds=1.0, device=device, patience=0.1))
+    values = run_trial(Trial("balls_up", "kim2018", seconds=1.0, device=device, time_limit=0.1))
     assert 2 <= values["steps"] < 100 and values["simulated"] == pytest.approx(1e-3 * values["steps"])
     assert all(0.0 < values[key] < 1e4 for key in ("ti_ms", "tf_ms", "tr_ms")) and not values["ended"]
 

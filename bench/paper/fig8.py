@@ -19,7 +19,7 @@ COLORS = {"weak": "tab:green", "strong": "tab:red"}
 STEPS = (0.01, 0.03, 0.1, STEP, 1.0, 2.0)
 BARS = (1e6, 1e7, 4e7, 1e8)
 """Second choices: steps κ, and magnetizations of the bar [A/m]."""
-PATIENCE = 5000  # largest number of iterations of a second choice
+MOST_ITERATIONS = 5000  # largest number of iterations of a second choice
 
 
 def run(output: Output):
@@ -71,7 +71,7 @@ def _second_choices(output: Output) -> str:
     explicit = [method for method in methods if method[0] != "theta"]
 
     def outcome(dynamics, curve, choice):
-        errors = _trace(dynamics, curve, device=output.device, iterations=PATIENCE, **choice)
+        errors = _trace(dynamics, curve, device=output.device, iterations=MOST_ITERATIONS, **choice)
         iterations, error = len(errors), float(errors[-1])
         output.record(dynamics=dynamics, curve=curve, **choice, iterations=iterations, error=error)
         return _outcome(iterations, error)
@@ -91,7 +91,7 @@ def _second_choices(output: Output) -> str:
     bars, layouts = rows_of_bars(), rows_of_bars(cells=crystal_balls.OTHER_CELLS)
     columns, rows, length, width = crystal_balls.OTHER_CELLS
     return f"""**Does the result depend on the constants that the paper leaves open?** Iterations, or (error after
-{PATIENCE:,}).
+{MOST_ITERATIONS:,}).
 
 Other steps. With small steps damping-only LLG and even LLG converge under the strong bar, in hundreds and thousands of
 iterations. With large steps `theta-euler` does not converge there:

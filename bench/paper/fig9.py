@@ -149,14 +149,14 @@ def iterations(case: Case, h: np.ndarray, kappa: np.ndarray) -> np.ndarray:
 
 
 def _flow_step(s, old_s, old_r, target, omega, accelerated: bool) -> list[np.ndarray]:
-    """Advance the dual variable s by the exact flow; return it, the one before and the residual."""
+    """Advance the dual variable s by the exact flow; return the new s, the previous one and its residual."""
     r = target - s
     new = s + omega * r
     if accelerated:
         dr = r - old_r
         size = (dr * dr).sum(axis=1, keepdims=True)
-        share = (r * dr).sum(axis=1, keepdims=True) / np.where(size > 0.0, size, np.inf)
-        new = new - share * (s - old_s + omega * dr)
+        fraction = (r * dr).sum(axis=1, keepdims=True) / np.where(size > 0.0, size, np.inf)
+        new = new - fraction * (s - old_s + omega * dr)
     return [new, s, r]
 
 

@@ -11,8 +11,7 @@ from bench.paper.trials import SCENES, Trial, outcome_cells, run_trials
 from warpmag.moments.dynamics import STEP
 
 SECONDS, SMALL_SECONDS = 5.0, 0.1
-PATIENCE = 300.0
-"""Wall time after which a run is ended [s]."""
+TIME_LIMIT = 300.0  # wall time after which a run is ended [s]
 SATURATED = {
     "balls_up": {"saturation": 5e4},
     "alphabets": {"saturation": 1e4, "moment": 40.0},
@@ -51,7 +50,7 @@ def run(output: Output):
 
 def _trial(scene: str, seconds: float, device: str, method="warpmag", parameters=None, **settings) -> Trial:
     seconds *= SHORT if method == "kim2018" else 1.0
-    return Trial(scene, method, seconds, device, PATIENCE, parameters=(parameters or {}).get(scene, {}), **settings)
+    return Trial(scene, method, seconds, device, TIME_LIMIT, parameters=(parameters or {}).get(scene, {}), **settings)
 
 
 def _text(results: str, seconds: float) -> str:
@@ -62,7 +61,7 @@ def _text(results: str, seconds: float) -> str:
 blown up and stay together, in Falling Magnet they scatter and cling (Figs. 3 to 6).
 
 **Here:** steps of 1 ms, split into substeps by the speeds; "held" are bodies that touch a magnet, directly or through
-others. No body holds the letters, so all of them count. A run ends after {PATIENCE:g} s of waiting.
+others. No body holds the letters, so all of them count. A run ends after {TIME_LIMIT:g} s of wall time.
 
 Eq. 4 is λ times Kelvin's force on each moment, λ from 8 in weak fields to 1 in saturation. Between two magnets of
 different λ, action and reaction differ, and momentum is not conserved: a free magnet and the balls on one side of it

@@ -14,7 +14,7 @@ from warpmag.declarations.magnets import PRESETS
 SECONDS, SMALL_SECONDS = 1.0, 0.05
 RTOL = 1e-2
 """Magnetization error at which induction ends: below it ``theta-euler`` converges slowly in a pile of balls."""
-PATIENCE = {"cpu": 55.0, "gpu": 4.0}
+TIME_LIMIT = {"cpu": 55.0, "gpu": 4.0}
 """Wall time after which a run is ended [s]: the twelve runs take 15 minutes on two cores, two minutes on a GPU."""
 PAPERS_TIMES = {
     ("balls_up", "kim2018"): (20, 3.5, 14),
@@ -34,7 +34,7 @@ def run(output: Output):
     seconds = SMALL_SECONDS if output.small else SECONDS
     kind = "cpu" if output.device == "cpu" else "gpu"
     cases = itertools.product(SCENES, PRESETS)
-    trials = [Trial(scene, method, seconds, output.device, PATIENCE[kind], rtol=RTOL) for scene, method in cases]
+    trials = [Trial(scene, method, seconds, output.device, TIME_LIMIT[kind], rtol=RTOL) for scene, method in cases]
     rows = []
     for trial, values in run_trials(trials):
         output.record(**values)
@@ -53,7 +53,7 @@ def _text(results: str, kind: str) -> str:
 
 **Here:** rigid bodies are Newton's XPBD, and all three methods differ only in dynamics, curve and force law. On a CPU
 each run has two cores. Times are means over the steps done; a case ends after
-{round(1000 * SECONDS):,} steps or {PATIENCE[kind]:g} s, and its last columns describe the scene at that time.
+{round(1000 * SECONDS):,} steps or {TIME_LIMIT[kind]:g} s, and its last columns describe the scene at that time.
 
 Induction ends at an error of {RTOL:g} or after 1,000 evaluations. The paper does not state at which error a
 magnetization is converged; "until every M converges" may mean that M stopped moving, which slow pairs do long before

@@ -36,7 +36,7 @@ class Trial:
     method: str  # name of a published method, of :data:`warpmag.declarations.magnets.PRESETS`
     seconds: float  # simulated time [s]
     device: str  # name of the Warp device
-    patience: float  # wall time after which the run is ended [s], without the first step
+    time_limit: float  # wall time after which the run is ended [s], without the first step
     rtol: float = 1e-3  # magnetization error at which induction ends
     max_evaluations: int = 1000  # largest number of field evaluations of an induction
     pair_step: float = dynamics.STEP  # step κ of pairs of submagnetizations, see ``warpmag.moments.dynamics``
@@ -67,12 +67,12 @@ def run_trial(trial: Trial) -> dict:
     """Run a trial and return the values of its JSON line."""
     with tempfile.TemporaryDirectory() as folder:
         simulation = _load(trial, Path(folder))
-    simulation.frame_rate = 1.0 / simulation.step_size  # checks the patience after every step
+    simulation.frame_rate = 1.0 / simulation.step_size  # checks the time limit after every step
     simulation.run(1)  # compiles kernels, grows buffers and captures graphs
     ended, began = "", time.perf_counter()
     steps = max(1, round(trial.seconds / simulation.step_size))
     try:
-        simulation.run(steps, on_frame=lambda frame: time.perf_counter() - began < trial.patience)
+        simulation.run(steps, on_frame=lambda frame: time.perf_counter() - began < trial.time_limit)
     except SimulationError as error:
         ended = str(error)
     statistics = simulation.finish()

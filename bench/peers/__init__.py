@@ -44,7 +44,7 @@ class Peer:
     charges: bool = False  # true if it sums the field of point charges, shape [n]; only ``many`` runs such peers
 
     def prepare(self, positions, moments, device) -> Evaluation:
-        """Call the function; an error if its library is not installed."""
+        """Call the function; raises an error if its library is not installed."""
         return getattr(importlib.import_module(f"bench.peers.{self.module}"), self.name)(positions, moments, device)
 
 

@@ -117,7 +117,7 @@ def model_energy(center, radius, susceptibility, positions, radii, moments, alon
     d = np.linalg.norm(s, axis=1)
     w = model_weight(d * radius, radius, np.asarray(radii, float), np.asarray(alone, bool))
     u, m = s / d[:, None], w[:, None] * np.asarray(moments, float) / radius**3
-    c, among = u @ u.T, m @ m.T
+    c, products = u @ u.T, m @ m.T
     a, b = np.sum(u * m, axis=1), u @ m.T  # b[i, j] = u_i·m_j
     q = b.T - c * a[:, None]  # component along u_j of the part of moment i perpendicular to u_i
     total = 0.0
@@ -126,7 +126,7 @@ def model_energy(center, radius, susceptibility, positions, radii, moments, alon
         k = degree + 1.0
         # (m_i·∇_i)(m_j·∇_j) P(c)/(d_i d_j)^(l+1)
         mixed = k * k * np.outer(a, a) * p - k * (a[None] * q + a[:, None] * q.T) * slope + q * q.T * curve
-        mixed += (among - a[:, None] * b - q * a[None]) * slope
+        mixed += (products - a[:, None] * b - q * a[None]) * slope
         total += _response(degree, susceptibility) * np.sum(mixed / np.outer(d, d) ** (degree + 2.0))
     degree = np.arange(5, 400)[:, None]
     single = (degree + 1.0) ** 2 * a**2 + 0.5 * degree * (degree + 1.0) * (np.sum(m * m, axis=1) - a**2)

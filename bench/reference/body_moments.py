@@ -126,8 +126,8 @@ def main() -> None:
         exact, (moments, evaluations, count) = reference(), moments_of_cells(solid, options.half, options.device)
         for j, direction in enumerate(("across", "along")):
             cells = "  ".join(
-                f"{value:8.4f} {100.0 * (value / true - 1.0):+5.2f} % {int(taken):4d}"
-                for value, true, taken in zip(moments[:, j], exact[:, j], evaluations[:, j], strict=True)
+                f"{value:8.4f} {100.0 * (value / true - 1.0):+5.2f} % {int(evaluated):4d}"
+                for value, true, evaluated in zip(moments[:, j], exact[:, j], evaluations[:, j], strict=True)
             )
             print(f"{name:17s} {count:5d} {direction:6s} {cells}", flush=True)
 

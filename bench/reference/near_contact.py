@@ -159,16 +159,16 @@ class NearContacts:
         self.direction = self.separation / np.maximum(length, np.finfo(float).tiny)[:, None]
         self.distance = np.maximum(length, 1e-12 * (a + b))  # keeps powers of 1/d with zero weight finite
         self.scale = 2.0 * a * b / (a + b)  # the curvature of the gap
-        both = shared_volume(self.distance, a, b)
-        crowding = crowding_weight(np.bincount(i, both, n) + np.bincount(j, both, n))
+        shared = shared_volume(self.distance, a, b)
+        crowding = crowding_weight(np.bincount(i, shared, n) + np.bincount(j, shared, n))
         gap = (self.distance - a - b) / self.scale
         self.present = crowding[i] * crowding[j]
         weight = self.present * similarity(a, b)
         self.quadrupole = [weight * factor for factor in quadrupole_window(self.distance, a, b)]
-        share = (w[i] * w[j] * weight)[:, None]
+        factor = (w[i] * w[j] * weight)[:, None]
         functions = [conductances(gap, y[ball], y[other]) for ball, other in ((i, j), (j, i))]
-        self.value = [share * self.scale[:, None] * value for value, _ in functions]  # of ball i and of ball j
-        self.slope = [share * slope for _, slope in functions]
+        self.value = [factor * self.scale[:, None] * value for value, _ in functions]  # of ball i and of ball j
+        self.slope = [factor * slope for _, slope in functions]
         self.short_range = self._short_range()
         self.conductance = self._conductance()
 
@@ -206,8 +206,8 @@ class NearContacts:
         on_dipoles = 5.0 * n[:, :, None] * along[:, None, :] - 2.0 * projected.transpose(0, 2, 1)
         block[:, 1:4, 4:] = on_dipoles / d**4
         block[:, 4:, 1:4] = -on_dipoles.transpose(0, 2, 1) / d**4
-        among = 2.0 * np.einsum("akl,bkl->ab", _BASIS, _BASIS)[None] + 35.0 * along[:, :, None] * along[:, None, :]
-        block[:, 4:, 4:] = (among - 20.0 * np.einsum("pak,pbk->pab", projected, projected)) / (3.0 * d**5)
+        mutual = 2.0 * np.einsum("akl,bkl->ab", _BASIS, _BASIS)[None] + 35.0 * along[:, :, None] * along[:, None, :]
+        block[:, 4:, 4:] = (mutual - 20.0 * np.einsum("pak,pbk->pab", projected, projected)) / (3.0 * d**5)
         block[:, 4:, 1:] *= self.quadrupole[0][:, None, None]
         block[:, 1:4, 4:] *= self.quadrupole[0][:, None, None]
         matrix[self.i, :, self.j, :] = block
@@ -222,11 +222,11 @@ class NearContacts:
             axes_i, axes_j = self._axes(ball, sign), self._axes(other, -sign)
             a, b, c, d, e, f, g, h, i, j, k, l, o, p = self.value[side].T  # noqa: E741
             _, _, _, d_j, _, _, _, _, _, j_j, _, l_j, _, _ = self.value[1 - side].T
-            among = np.array([[a, c, i], [c, e, k], [i, k, o]])
+            own = np.array([[a, c, i], [c, e, k], [i, k, o]])
             cross = np.array([[b, d, j], [d_j, f, l], [j_j, l_j, p]])
             across = np.eye(3) - self.direction[:, :, None] * self.direction[:, None, :]
             across = across * self.radii[ball, None, None]
-            block = np.einsum("uvp,pua,pvb->pab", among, axes_i, axes_i)
+            block = np.einsum("uvp,pua,pvb->pab", own, axes_i, axes_i)
             block[:, 1:4, 1:4] += (g * self.radii[ball])[:, None, None] * across
             np.add.at(matrix, (ball, slice(None), ball), block)
             block = np.einsum("uvp,pua,pvb->pab", cross, axes_i, axes_j)

@@ -109,7 +109,7 @@ def _areas(lower, upper, axis) -> np.ndarray:
 
 
 def _seen_from(points, lower, upper, axes, axis: int):
-    """Indices of rectangles normal to ``axis``, their heights over points, and signs and places of their corners."""
+    """Indices of rectangles normal to ``axis``, heights over points, and signs and coordinates of their corners."""
     chosen, (a, b) = np.flatnonzero(axes == axis), ((axis + 1) % 3, (axis + 2) % 3)
     corners = []
     for i, j in np.ndindex(2, 2):

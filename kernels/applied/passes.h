@@ -169,7 +169,7 @@ template <class Arrays> CUDA_CALLABLE inline void react(const Arrays& arrays, in
 }
 
 // Adds the wrenches of other permanent bodies on body b. Both bodies of a pair integrate the surface charges of the
-// smaller body, so that action and reaction are equal to the last bit.
+// smaller body, so that action and reaction are bitwise equal.
 template <class Arrays>
 CUDA_CALLABLE inline void add_body_pairs(const Arrays& arrays, int b, Real (&total)[WRENCH_ROW]) {
     const PermanentBody body = body_at(arrays, b);

@@ -79,8 +79,8 @@ template <class Arrays> CUDA_CALLABLE inline PermanentBody body_at(const Arrays&
             row[3]};
 }
 
-// Moment j of a body's lattice that the closed form replaces. If the body responds to fields, only the part by the
-// remanence.
+// Moment j of a body's lattice that the closed form replaces: only the part by the remanence if the body responds to
+// fields.
 template <class Arrays> CUDA_CALLABLE inline Real3 moment_at(const Arrays& arrays, const PermanentBody& body, int j) {
     if (!body.responds) return packed_real3(arrays, 4, j);
     const Real radius = packed_at(arrays, 3, j), volume = Real(4.18879020478639) * radius * radius * radius;

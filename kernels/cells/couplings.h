@@ -36,10 +36,10 @@ CUDA_CALLABLE inline Vector sum_entries(const Couplings& c, const Real* const mo
     return group_sums(h);
 }
 
-// Low-order field at places in a body: a[0..2] is a uniform field, a[3..7] are the coefficients of the linear fields
+// Low-order field at positions in a body: a[0..2] is a uniform field, a[3..7] are the coefficients of the linear fields
 // ∇(x² − z²)/2, ∇(y² − z²)/2, ∇xy, ∇xz and ∇yz.
-CUDA_CALLABLE inline Vector common_field(const Real* a, Vector place) {
-    const Number &x = place.x, &y = place.y, &z = place.z;
+CUDA_CALLABLE inline Vector common_field(const Real* a, Vector position) {
+    const Number &x = position.x, &y = position.y, &z = position.z;
     return {a[0] + a[3] * x + a[5] * y + a[6] * z, a[1] + a[5] * x + a[4] * y + a[7] * z,
             a[2] + a[6] * x + a[7] * y - (a[3] + a[4]) * z};
 }
@@ -48,12 +48,12 @@ CUDA_CALLABLE inline Vector common_field(const Real* a, Vector place) {
 template <class Couplings> CUDA_CALLABLE inline void share_field(const Couplings& c, int body) {
     const auto& rows = c.rows.data[body]; // range of the body's rows
     const int table = c.chunk.data[rows[0] / CHUNK][3] - rows[0];
-    const size_t pitch = c.body_moments.strides[0] / sizeof(Real), places = c.place.strides[0] / sizeof(Real);
+    const size_t pitch = c.body_moments.strides[0] / sizeof(Real), stride = c.position.strides[0] / sizeof(Real);
     Vector sums[3] = {};
     for (int row = rows[0] + WIDTH * share(); row < rows[1]; row += WIDTH * SHARES) {
-        const Real *const own = c.body_moments.data + row, *const at = c.place.data + table + row;
+        const Real *const own = c.body_moments.data + row, *const at = c.position.data + table + row;
         const Vector m = {numbers(own), numbers(own + pitch), numbers(own + 2 * pitch)};
-        const Number x = numbers(at), y = numbers(at + places), z = numbers(at + 2 * places);
+        const Number x = numbers(at), y = numbers(at + stride), z = numbers(at + 2 * stride);
         sums[0] += m;
         sums[1] += Vector{x * m.x - z * m.z, y * m.y - z * m.z, x * m.y + y * m.x};
         sums[2] += Vector{x * m.z + z * m.x, y * m.z + z * m.y, z * 0};
@@ -116,14 +116,14 @@ template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Coupli
         put(own + 2 * pitch, m.z);
         return;
     }
-    const int in_table = row - chunk[2] + chunk[3];
-    const Vector sums = sum_entries(c, c.body_moments.data + chunk[2], in_table);
+    const int table_row = row - chunk[2] + chunk[3];
+    const Vector sums = sum_entries(c, c.body_moments.data + chunk[2], table_row);
     if (share() != 0) return;
     const Vector m = {numbers(own), numbers(own + pitch), numbers(own + 2 * pitch)};
-    const size_t places = c.place.strides[0] / sizeof(Real);
-    const Real* const at = c.place.data + in_table;
-    const Vector place = {numbers(at), numbers(at + places), numbers(at + 2 * places)};
-    const Vector common = common_field(c.common.data + (size_t)body * COMMON, place);
+    const size_t stride = c.position.strides[0] / sizeof(Real);
+    const Real* const at = c.position.data + table_row;
+    const Vector position = {numbers(at), numbers(at + stride), numbers(at + 2 * stride)};
+    const Vector common = common_field(c.common.data + (size_t)body * COMMON, position);
     const Vector h = sums + common - numbers(c.hardness.data + row) * m;
     Real* const field = (Real*)c.h.data + 3 * (size_t)i;
     put_vectors(field, lane_count, vectors(field, lane_count) + to_world(rotation, h));

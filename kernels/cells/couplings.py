@@ -38,7 +38,7 @@ def couplings_type(dtype):
         slot_begin: wp.array[int]  # first slot of each chunk of all tables, and the end
         other: wp.array[int]  # cell of the body that an entry refers to, shape [slots · CHUNK]
         tensor: wp.array[dtype]  # T_ij [1/m³]: xx, yy, zz, xy, xz, yz of CHUNK cells per slot; zero after a list's end
-        place: wp.array2d[dtype]  # positions of cells for the low-order fields of their body, shape [3, rows]
+        position: wp.array2d[dtype]  # positions of cells for the low-order fields of their body, shape [3, rows]
         # Model: bodies
         chunk: wp.array[wp.vec4i]  # first moment, count, first row of the body, first row of its table, shape [chunks]
         body: wp.array[int]  # body of a chunk, shape [chunks]
@@ -95,8 +95,8 @@ class CellCouplings:
         packed: All moments, packed (``packing.PackedMoments``).
         moments: Moments [A·m²], Warp array, shape [n].
         h: Field to add to [A/m], Warp array, shape [n].
-        whole: True for bodies solved as a whole (``induction``), which :meth:`launch_others` leaves out, shape
-            [bodies]; None means no such body.
+        whole: True for bodies with a collective response (``induction``), which :meth:`launch_others` leaves out,
+            shape [bodies]; None means no such body.
 
     Attributes:
         rotations: Rotation from each body's frame to the world, shape [bodies]; written by the caller.
@@ -137,8 +137,8 @@ class CellCouplings:
         return launch_passes(kernel, first, last + 1, couplings, device=device, record_cmd=True, **sizes)
 
     def _lay_out(self, bodies, whole, worlds, dtype, device) -> int:
-        """Fill the arrays; return the number of chunks of the bodies that are not whole, which come first."""
-        c, first_rows, tables, places, chunks, body, other_chunks = self._couplings, {}, [], [], [], [], 0
+        """Fill the arrays; return the number of chunks of bodies without a collective response, which come first."""
+        c, first_rows, tables, positions, chunks, body, other_chunks = self._couplings, {}, [], [], [], [], 0
         self.rows = np.zeros(len(bodies), int)
         whole = np.zeros(len(bodies), bool) if whole is None else np.asarray(whole, bool)
         for number in np.argsort(whole, kind="stable").tolist():
@@ -146,8 +146,8 @@ class CellCouplings:
             if id(coupling) not in first_rows:
                 first_rows[id(coupling)] = CHUNK * sum(len(slots) for slots, _, _ in tables)
                 tables.append(_table(coupling.start, coupling.other, coupling.tensor))
-                positions = coupling.scaled_positions
-                places.append(np.pad(positions.T, ((0, 0), (0, -len(positions) % CHUNK))))
+                scaled = coupling.scaled_positions
+                positions.append(np.pad(scaled.T, ((0, 0), (0, -len(scaled) % CHUNK))))
             count, row = len(coupling.start) - 1, CHUNK * len(chunks)
             self.rows[number] = row
             starts = range(0, count, CHUNK)
@@ -166,7 +166,7 @@ class CellCouplings:
         c.rotation = put(identity, wp.types.quaternion(dtype))
         ends = self.rows + CHUNK * np.bincount(body, minlength=len(bodies))
         c.rows = put(np.stack([self.rows, ends], axis=1).astype(np.int32), wp.vec2i)
-        c.place = put(np.concatenate(places, axis=1), dtype)
+        c.position = put(np.concatenate(positions, axis=1), dtype)
         c.matrix = put(np.concatenate([coupling.common.ravel() for _, coupling in bodies]), dtype)
         c.hardening = put([coupling.hardening for _, coupling in bodies], dtype)
         c.common = wp.zeros(COMMON * len(bodies), dtype=dtype, device=device)
@@ -186,6 +186,6 @@ class CellCouplings:
             launch.launch()
 
     def launch_others(self):
-        """Add the corrections of bodies that are not whole to the field."""
+        """Add the corrections of bodies without a collective response to the field."""
         for launch in self._others:
             launch.launch()

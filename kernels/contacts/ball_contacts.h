@@ -53,55 +53,55 @@ CUDA_CALLABLE inline Real nearest_on_box(wp::vec3 size, wp::vec3 c, wp::vec3& co
 
 // Contact of a ball with another shape, for shapes a < b.
 template <class Arrays> CUDA_CALLABLE inline BallContact detect_ball_contact(const Arrays& arrays, int a, int b) {
-    BallContact t;
-    const bool first = arrays.kind.data[a] == BALL;
-    t.ball = first ? a : b, t.other = first ? b : a;
-    const int kind = arrays.kind.data[t.other];
-    const wp::transform frame = arrays.frame.data[t.other];
-    wp::vec3 c = arrays.frame.data[t.ball].p - frame.p;
-    t.core = wp::vec3(0, 0, 0);
-    t.core_radius = kind == BALL || kind == CAPSULE ? size_component(arrays, t.other, 0) : Real(0);
+    BallContact contact;
+    const bool a_is_ball = arrays.kind.data[a] == BALL;
+    contact.ball = a_is_ball ? a : b, contact.other = a_is_ball ? b : a;
+    const int kind = arrays.kind.data[contact.other];
+    const wp::transform frame = arrays.frame.data[contact.other];
+    wp::vec3 center = arrays.frame.data[contact.ball].p - frame.p;
+    contact.core = wp::vec3(0, 0, 0);
+    contact.core_radius = kind == BALL || kind == CAPSULE ? size_component(arrays, contact.other, 0) : Real(0);
     Real distance;
-    if (kind != BALL) c = wp::quat_rotate_inv(frame.q, c);
+    if (kind != BALL) center = wp::quat_rotate_inv(frame.q, center);
     if (kind == PLANE) {
-        t.core = wp::vec3(c[0], c[1], 0);
-        t.direction = wp::vec3(0, 0, -1);
-        distance = c[2];
+        contact.core = wp::vec3(center[0], center[1], 0);
+        contact.direction = wp::vec3(0, 0, -1);
+        distance = center[2];
     } else if (kind == BOX) {
-        distance = nearest_on_box(arrays.scale.data[t.other], c, t.core, t.direction);
+        distance = nearest_on_box(arrays.scale.data[contact.other], center, contact.core, contact.direction);
     } else {
         if (kind == CAPSULE) {
             // as in Newton: the term against division by zero moves the point slightly toward an end
-            const Real half = size_component(arrays, t.other, 1), along = 2 * half;
-            const Real part = (c[2] + half) * along / (along * along + Real(1e-6));
-            t.core[2] = along * (part < 0 ? 0 : part > 1 ? 1 : part) - half;
+            const Real half = size_component(arrays, contact.other, 1), axis_length = 2 * half;
+            const Real fraction = (center[2] + half) * axis_length / (axis_length * axis_length + Real(1e-6));
+            contact.core[2] = axis_length * (fraction < 0 ? 0 : fraction > 1 ? 1 : fraction) - half;
         }
-        t.direction = t.core - c;
-        distance = wp::length(t.direction);
-        if (distance > 0) t.direction = t.direction / distance;
-        else t.direction = kind == BALL ? wp::vec3(1, 0, 0) : wp::quat_rotate_inv(frame.q, wp::vec3(1, 0, 0));
+        contact.direction = contact.core - center;
+        distance = wp::length(contact.direction);
+        if (distance > 0) contact.direction = contact.direction / distance;
+        else contact.direction = kind == BALL ? wp::vec3(1, 0, 0) : wp::quat_rotate_inv(frame.q, wp::vec3(1, 0, 0));
     }
-    if (kind != BALL) t.direction = wp::quat_rotate(frame.q, t.direction);
-    t.separation =
-        distance - size_component(arrays, t.ball, 0) - t.core_radius - arrays.margin.data[a] - arrays.margin.data[b];
-    return t;
+    if (kind != BALL) contact.direction = wp::quat_rotate(frame.q, contact.direction);
+    contact.separation = distance - size_component(arrays, contact.ball, 0) - contact.core_radius
+                         - arrays.margin.data[a] - arrays.margin.data[b];
+    return contact;
 }
 
-// True if the surfaces are within the contact gap, or approach each other that far in the substep.
-template <class Arrays> CUDA_CALLABLE inline bool is_contact(const Arrays& arrays, const BallContact& t) {
-    if (t.separation <= arrays.gap.data[t.ball] + arrays.gap.data[t.other]) return true;
+// True if the surfaces are within the contact gap, or may meet in the substep.
+template <class Arrays> CUDA_CALLABLE inline bool is_contact(const Arrays& arrays, const BallContact& contact) {
+    if (contact.separation <= arrays.gap.data[contact.ball] + arrays.gap.data[contact.other]) return true;
     if (arrays.displacement.shape[0] == 0) return false;
-    wp::vec3 motion = arrays.displacement.data[t.other] - arrays.displacement.data[t.ball];
-    const int body = arrays.body.data[t.other];
-    if (body >= 0 && arrays.kind.data[t.other] != BALL) {
-        const wp::vec3 arm = wp::quat_rotate(arrays.frame.data[t.other].q, t.core);
+    wp::vec3 motion = arrays.displacement.data[contact.other] - arrays.displacement.data[contact.ball];
+    const int body = arrays.body.data[contact.other];
+    if (body >= 0 && arrays.kind.data[contact.other] != BALL) {
+        const wp::vec3 arm = wp::quat_rotate(arrays.frame.data[contact.other].q, contact.core);
         motion += arrays.dt * wp::cross(wp::spatial_bottom(arrays.body_qd.data[body]), arm);
     }
-    const Real approach = -wp::dot(motion, t.direction);
-    return (approach < arrays.farthest ? approach : arrays.farthest) >= t.separation;
+    const Real approach = -wp::dot(motion, contact.direction);
+    return (approach < arrays.farthest ? approach : arrays.farthest) >= contact.separation;
 }
 
-// Point of a shape's frame, and vector of the world's frame, in the frame of the shape's body.
+// Transforms of a point in a shape's frame, and of a vector in the world's frame, to the frame of the shape's body.
 template <class Arrays> CUDA_CALLABLE inline wp::vec3 point_in_body(const Arrays& arrays, int shape, wp::vec3 point) {
     return wp::transform_point(arrays.placement.data[shape], point);
 }
@@ -110,18 +110,20 @@ template <class Arrays> CUDA_CALLABLE inline wp::vec3 vector_in_body(const Array
 }
 
 // Writes a contact as Newton's contact i.
-template <class Arrays> CUDA_CALLABLE inline void write_contact(const Arrays& arrays, const BallContact& t, int i) {
-    const bool ball_first = arrays.kind.data[t.other] >= BALL;
-    const int shapes[2] = {ball_first ? t.ball : t.other, ball_first ? t.other : t.ball};
-    const wp::vec3 normal = ball_first ? t.direction : -t.direction;
+template <class Arrays>
+CUDA_CALLABLE inline void write_contact(const Arrays& arrays, const BallContact& contact, int i) {
+    const bool ball_first = arrays.kind.data[contact.other] >= BALL;
+    const int shapes[2] = {ball_first ? contact.ball : contact.other, ball_first ? contact.other : contact.ball};
+    const wp::vec3 normal = ball_first ? contact.direction : -contact.direction;
     const auto& out = arrays.contacts;
     out.shape0.data[i] = shapes[0], out.shape1.data[i] = shapes[1];
     out.normal.data[i] = normal;
     for (int end = 0; end < 2; ++end) {
         const int shape = shapes[end];
-        const bool is_ball = shape == t.ball;
-        const Real outside = (is_ball ? size_component(arrays, shape, 0) : t.core_radius) + arrays.margin.data[shape];
-        const wp::vec3 point = point_in_body(arrays, shape, is_ball ? wp::vec3(0, 0, 0) : t.core);
+        const bool is_ball = shape == contact.ball;
+        const Real outside =
+            (is_ball ? size_component(arrays, shape, 0) : contact.core_radius) + arrays.margin.data[shape];
+        const wp::vec3 point = point_in_body(arrays, shape, is_ball ? wp::vec3(0, 0, 0) : contact.core);
         const wp::vec3 offset = vector_in_body(arrays, shape, end == 0 ? outside * normal : -outside * normal);
         (end == 0 ? out.point0 : out.point1).data[i] = point;
         (end == 0 ? out.offset0 : out.offset1).data[i] = offset;

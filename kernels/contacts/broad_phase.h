@@ -54,8 +54,8 @@ template <class Lists> inline void find_search_distance(const Lists& lists) {
 #endif
 
 // Stores the swept box of a shape. For a ball, stores the center and radius of a ball that encloses it throughout the
-// substep. Sets a flag if the neighbor lists are out of date. For a ball that moves farther than ``farthest``, the
-// enclosing ball is at the present position, and that distance is added to the radius.
+// substep. Sets a flag if the neighbor lists are out of date. If a ball moves farther than ``farthest``, the enclosing
+// ball is at its present position, and ``farthest`` is added to its radius.
 template <class Arrays> CUDA_CALLABLE inline void place_target(const Arrays& arrays, int target) {
     const int balls = arrays.lists.group.shape[0], shape = arrays.shape.data[target];
     if (target >= balls) {
@@ -75,8 +75,8 @@ template <class Arrays> CUDA_CALLABLE inline void place_target(const Arrays& arr
     motion = sqrt(motion);
     const bool far = motion > arrays.farthest;
     for (int c = 0; c < 3; ++c) {
-        const Real sides = row_of(arrays.lower, shape)[c] + row_of(arrays.upper, shape)[c];
-        const Real x = Real(0.5) * (far ? sides : sides + d[c]);
+        const Real corners = row_of(arrays.lower, shape)[c] + row_of(arrays.upper, shape)[c];
+        const Real x = Real(0.5) * (far ? corners : corners + d[c]);
         packed[c * pitch] = x;
         moved += (x - list_position[c]) * (x - list_position[c]);
     }
@@ -120,7 +120,7 @@ template <class Arrays> CUDA_CALLABLE inline bool may_collide(const Arrays& arra
 
 // True if the boxes of two shapes, moving at constant velocity, overlap at some time of the substep.
 template <class Arrays> CUDA_CALLABLE inline bool boxes_overlap(const Arrays& arrays, int a, int b) {
-    Real enter = 0, leave = 1;
+    Real start = 0, end = 1; // fractions of the substep
     for (int c = 0; c < 3; ++c) {
         const Real before = row_of(arrays.lower, b)[c] - row_of(arrays.upper, a)[c];
         const Real behind = row_of(arrays.upper, b)[c] - row_of(arrays.lower, a)[c];
@@ -129,15 +129,15 @@ template <class Arrays> CUDA_CALLABLE inline bool boxes_overlap(const Arrays& ar
             if (!(before <= 0 && behind >= 0)) return false;
         } else {
             const Real first = (d > 0 ? before : behind) / d, last = (d > 0 ? behind : before) / d;
-            enter = first > enter ? first : enter;
-            leave = last < leave ? last : leave;
+            start = first > start ? first : start;
+            end = last < end ? last : end;
         }
     }
-    return enter <= leave;
+    return start <= end;
 }
 
-// Tests a pair of shapes. Calls report(a, b), a < b, for a pair of Newton's narrow phase, and report(a, b, contact) for
-// a contact of a ball.
+// Tests a pair of shapes. Calls report(a, b), a < b, for a pair that is left to Newton's narrow phase, and report(a, b,
+// contact) for a contact of a ball.
 template <class Arrays, class Report>
 CUDA_CALLABLE inline void test_pair(const Arrays& arrays, int shape, int other, Report report) {
     const int a = shape < other ? shape : other, b = shape < other ? other : shape;
@@ -161,14 +161,14 @@ template <class Visit> CUDA_CALLABLE inline void for_each_lane(Mask mask, Visit 
 
 // Lanes of the vector of swept boxes from column ``first`` on that overlap another box.
 CUDA_CALLABLE inline Mask overlapping(const Real* boxes, size_t pitch, int first, const Box& own) {
-    Mask meet = mask_of(lanes() == lanes());
+    Mask overlap = mask_of(lanes() == lanes());
     for (int c = 0; c < 3; ++c)
-        meet &= (numbers(boxes + c * pitch + first) <= own.upper[c])
-                & (numbers(boxes + (c + 3) * pitch + first) >= own.lower[c]);
-    return meet;
+        overlap &= (numbers(boxes + c * pitch + first) <= own.upper[c])
+                   & (numbers(boxes + (c + 3) * pitch + first) >= own.lower[c]);
+    return overlap;
 }
 
-// Tests a target's shape with other shapes ``begin`` to ``end`` whose swept boxes overlap its own.
+// Tests a target's shape against other shapes ``begin`` to ``end`` whose swept boxes overlap its own.
 template <class Arrays, class Report>
 CUDA_CALLABLE inline void test_boxes(const Arrays& arrays, int shape, const Box& own, int begin, int end,
                                      Report report) {
@@ -192,9 +192,9 @@ CUDA_CALLABLE inline void test_boxes(const Arrays& arrays, int shape, const Box&
     for (int block = begin / WIDTH; block * WIDTH < end; block += WIDTH) {
         for_each_lane(overlapping(arrays.bounds.data, arrays.bounds.shape[1], block, own), [&](int b) {
             const int first = (block + b) * WIDTH;
-            const Mask meet = overlapping(arrays.boxes.data, arrays.boxes.shape[1], first, own)
-                              & mask_of((lanes() >= begin - first) & (lanes() < end - first));
-            for_each_lane(meet, [&](int l) { test_pair(arrays, shape, others[first + l], report); });
+            const Mask overlap = overlapping(arrays.boxes.data, arrays.boxes.shape[1], first, own)
+                                 & mask_of((lanes() >= begin - first) & (lanes() < end - first));
+            for_each_lane(overlap, [&](int l) { test_pair(arrays, shape, others[first + l], report); });
         });
     }
 #endif
@@ -213,12 +213,12 @@ CUDA_CALLABLE inline void find_pairs_of(const Arrays& arrays, int target, Report
         for (int n = share() * WIDTH; n < (listed ? count : target); n += SHARES * WIDTH) {
             const Index j = listed ? indices(list + n) : n + lanes();
             const auto earlier = (j < target) & (lanes() < (listed ? count : target) - n);
-            const Index place = earlier ? j : Index(0);
-            const Vector r = {own.x[target] - collect(own.x, place), own.y[target] - collect(own.y, place),
-                              own.z[target] - collect(own.z, place)};
-            const Number reach = own.radius[target] + collect(own.radius, place);
+            const Index index = earlier ? j : Index(0);
+            const Vector r = {own.x[target] - collect(own.x, index), own.y[target] - collect(own.y, index),
+                              own.z[target] - collect(own.z, index)};
+            const Number reach = own.radius[target] + collect(own.radius, index);
             for_each_lane((dot(r, r) <= reach * reach) & mask_of(earlier),
-                          [&](int l) { test_pair(arrays, shape, arrays.shape.data[lane_of(place, l)], report); });
+                          [&](int l) { test_pair(arrays, shape, arrays.shape.data[lane_of(index, l)], report); });
         }
     } else {
         last = target - balls;
@@ -226,7 +226,7 @@ CUDA_CALLABLE inline void find_pairs_of(const Arrays& arrays, int target, Report
     const Box own = swept_box(arrays, shape);
     const wp::vec2i range = arrays.range.data[target];
     test_boxes(arrays, shape, own, 0, arrays.shared < last ? arrays.shared : last, report);
-    // shapes of a world that cannot move do not collide with each other
+    // immovable shapes of a world do not collide with each other
     if (target < balls || arrays.body.data[shape] >= 0)
         test_boxes(arrays, shape, own, range[0], range[1] < last ? range[1] : last, report);
 }

@@ -50,7 +50,7 @@ _lists_type = neighbors.lists_type(wp.float32)
 
 @wp.struct
 class BroadPhaseArrays:
-    """Arrays of the broad phase, for s shapes, of which t targets can collide: b balls, then o others."""
+    """Arrays of the broad phase, for s shapes. The t shapes that can collide are targets: b balls, then o others."""
 
     # Model:
     lower: wp.array[wp.vec3]  # corners of the boxes around shapes, enlarged by the detection distance [m], shape [s]

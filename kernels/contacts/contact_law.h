@@ -11,8 +11,8 @@
 //    add impulses, and end at some state without overlap. The iterations here converge to the smallest impulses that
 //    prevent overlap.
 //
-// 2. Penetration recovery. Overlapping bodies separate at RECOVERY_SPEED (from Python) at most. So bodies that were
-//    placed into each other do not fly apart.
+// 2. Penetration recovery. Overlapping bodies separate at RECOVERY_SPEED (from Python) at most. So bodies that overlap
+//    at the start do not fly apart.
 //
 // 3. Conserved angular momentum. The impulse acts at one point on both bodies. That point lies between the surfaces
 //    where they are before the substep, nearer to the surface of the lighter body. Lever arms at the new poses have
@@ -30,7 +30,7 @@
 //    include those that removed overlap, and throw a chain of 1,000 balls apart.
 //
 // A contact is evaluated from one of its two bodies, called the own body. Evaluated from the other body, its impulses
-// are opposite to the last bit.
+// are bitwise opposite.
 #pragma once
 #include "shared/inverse_root.h"
 #include "shared/vectors.h"
@@ -118,8 +118,8 @@ CUDA_CALLABLE inline Vector clamp_components(Vector a, Vector n, Number across, 
 // Unit vector perpendicular to the unit vector n.
 CUDA_CALLABLE inline Vector perpendicular(Vector n) {
     const Number zero = n.x * Real(0);
-    const auto steep = n.x * n.x > Real(0.5);
-    const Vector t = {steep ? n.y : zero, steep ? -n.x : n.z, steep ? zero : -n.y};
+    const auto near_x = n.x * n.x > Real(0.5);
+    const Vector t = {near_x ? n.y : zero, near_x ? -n.x : n.z, near_x ? zero : -n.y};
     return inverse_length(t) * t;
 }
 
@@ -157,25 +157,27 @@ constexpr Real SLIP_RETURN = Real(0.3);
 
 // Prepares a contact with accumulated ``slip`` for iterations that apply the fraction ``relaxation`` of each
 // correction.
-CUDA_CALLABLE inline Contact prepare_contact(const DetectedContact& t, const Pose& own, const Pose& other,
+CUDA_CALLABLE inline Contact prepare_contact(const DetectedContact& detected, const Pose& own, const Pose& other,
                                              const Body& body, const Body& other_body, const Inertia& inertia,
                                              const Inertia& other_inertia, const Slip& slip, Real relaxation, Real dt) {
-    const Vector n = t.normal, apart = own.x - other.x;
-    const Vector surface = rotate(own.q, t.surface), other_surface = rotate(other.q, t.other_surface);
+    const Vector n = detected.normal, apart = own.x - other.x;
+    const Vector surface = rotate(own.q, detected.surface), other_surface = rotate(other.q, detected.other_surface);
     const Number total = body.inv_mass + other_body.inv_mass;
     const Vector surfaces_apart = apart + (surface - other_surface);
     Contact c;
     c.normal = n;
     c.arm = surface - divide_or_zero(other_body.inv_mass, total) * surfaces_apart;
     c.other_arm = other_surface + divide_or_zero(body.inv_mass, total) * surfaces_apart;
-    const Vector points = rotate(own.q, t.point) - rotate(other.q, t.other_point);
+    const Vector points = rotate(own.q, detected.point) - rotate(other.q, detected.other_point);
     // a kinematic body is already at its pose of the substep's end, but its velocity still moves its surface; the gap
     // speed excludes that velocity
     const Vector own_velocity = body.v + cross(body.omega, c.arm);
     const Vector other_rotation = cross(other_body.omega, c.other_arm);
     const Vector other_velocity = other_body.v + other_rotation;
-    const Number kinematic_speed = t.kinematic * dot(n, own_velocity) - t.other_kinematic * dot(n, other_velocity);
-    c.gap_speed = larger((dot(n, apart + points) - t.margin) / dt - kinematic_speed, n.x * Real(0) - RECOVERY_SPEED);
+    const Number kinematic_speed =
+        detected.kinematic * dot(n, own_velocity) - detected.other_kinematic * dot(n, other_velocity);
+    c.gap_speed =
+        larger((dot(n, apart + points) - detected.margin) / dt - kinematic_speed, n.x * Real(0) - RECOVERY_SPEED);
     // mass_splitting.py bounds these sums of the mobilities of both bodies
     const Number zero = n.x * Real(0), own_normal = mobility(body, inertia, c.arm, n, n),
                  other_normal = mobility(other_body, other_inertia, c.other_arm, n, n);
@@ -185,7 +187,7 @@ CUDA_CALLABLE inline Contact prepare_contact(const DetectedContact& t, const Pos
     c.tangential_mass = divide_or_zero(zero + Real(FRICTION) * relaxation, own_tangential + other_tangential);
     c.angular_mass = divide_or_zero(zero + Real(FRICTION) * relaxation,
                                     angular_mobility(body, inertia) + angular_mobility(other_body, other_inertia));
-    c.mu = t.mu, c.torsional = t.torsional, c.rolling = t.rolling;
+    c.mu = detected.mu, c.torsional = detected.torsional, c.rolling = detected.rolling;
     c.return_velocity = {SLIP_RETURN / dt * tangential(slip.linear, n), SLIP_RETURN / dt * slip.angular};
     return c;
 }
@@ -222,25 +224,27 @@ struct AccumulatedImpulse {
 // Nesterov's momentum: the fraction of its last change by which an impulse is extrapolated. It is bounded, which makes
 // restarts unnecessary. It is 0 in the last iteration, so that the final impulses are in the friction cone.
 CUDA_CALLABLE inline Real momentum_at(int iteration, int iterations) {
-    const Real part = Real(iteration) / (iteration + 3), most = Real(MOMENTUM);
-    return iteration == iterations - 1 ? 0 : part < most ? part : most;
+    const Real fraction = Real(iteration) / (iteration + 3), limit = Real(MOMENTUM);
+    return iteration == iterations - 1 ? 0 : fraction < limit ? fraction : limit;
 }
 // Performs an iteration of a contact and returns the impulse to add to the bodies.
 CUDA_CALLABLE inline Impulse iterate_contact(const Contact& c, const Body& own, const Body& other,
                                              AccumulatedImpulse& impulse, Real momentum) {
-    const Impulse now = relax_impulse(c, own, other, impulse.extrapolated), gain = difference(impulse.last, now);
-    const Impulse extrapolated = {now.linear + momentum * gain.linear, now.angular + momentum * gain.angular};
+    const Impulse relaxed = relax_impulse(c, own, other, impulse.extrapolated),
+                  change = difference(impulse.last, relaxed);
+    const Impulse extrapolated = {relaxed.linear + momentum * change.linear,
+                                  relaxed.angular + momentum * change.angular};
     const Impulse added = difference(impulse.extrapolated, extrapolated);
-    impulse = {now, extrapolated};
+    impulse = {relaxed, extrapolated};
     return added;
 }
 // Accumulated slip of a contact [m, rad] at the end of a substep, with the impulse p after the last iteration.
 CUDA_CALLABLE inline Slip accumulated_slip(const Contact& c, const Body& own, const Body& other, Impulse p,
                                            Real relaxation, Real dt) {
     const Slip velocity = relative_velocity(c, own, other);
-    auto after = [&](Vector returning, Vector now) { return dt * (1 / SLIP_RETURN * returning + now); };
-    const Vector linear = after(c.return_velocity.linear, tangential(velocity.linear, c.normal));
-    const Vector angular = after(c.return_velocity.angular, velocity.angular);
+    auto slip_of = [&](Vector returning, Vector speed) { return dt * (1 / SLIP_RETURN * returning + speed); };
+    const Vector linear = slip_of(c.return_velocity.linear, tangential(velocity.linear, c.normal));
+    const Vector angular = slip_of(c.return_velocity.angular, velocity.angular);
     const Number push = Real(FRICTION) * relaxation * dt / SLIP_RETURN * dot(p.linear, c.normal);
     const Number per_angle = divide_or_zero(push, c.angular_mass);
     return {clamp_length(linear, divide_or_zero(c.mu * push, c.tangential_mass)),

@@ -31,8 +31,8 @@ wp.set_module_options({"enable_backward": False})
 
 _RECOVERY_SPEED = wp.constant(RECOVERY_SPEED)
 _CLOSING_SPEED = wp.constant(2.0)
-"""Limit of the speed at which joint ends that are apart close, and slides return into their limits [m/s]. Bodies keep
-that speed, and it would grow with shorter substeps if each closed the whole distance."""
+"""Limit of the speed at which separated ends of a joint approach, and slides return into their limits [m/s]. Bodies
+keep that speed, and it would grow with shorter substeps if each closed the whole distance."""
 _RETURN_RATE = wp.constant(10.0)  # limit of the angular speed at which hinges return into their limits [rad/s]
 
 
@@ -134,23 +134,23 @@ def _prepare_joints(
     for dof in range(first, joints.dof_start[joint + 1]):
         lower_out[dof] = joints.lower[dof]
         upper_out[dof] = joints.upper[dof]
-    turn, apart = wp.quat_identity(), wp.vec3(0.0)
+    rotation, apart = wp.quat_identity(), wp.vec3(0.0)
     if joints.one_axis[joint]:
         x, axis = wp.vec3(1.0, 0.0, 0.0), wp.normalize(joints.axis[first])
         middle = x + axis
-        turn = wp.quat(0.0, 0.0, 1.0, 0.0)
+        rotation = wp.quat(0.0, 0.0, 1.0, 0.0)
         if wp.length_sq(middle) > 1.0e-6:
             half = wp.normalize(middle)
-            turn = wp.quat(wp.cross(x, half), wp.dot(x, half))
+            rotation = wp.quat(wp.cross(x, half), wp.dot(x, half))
         axis_out[first] = x
-        place, step = _angle(joints, bodies, joint, axis), _RETURN_RATE * dt
+        position, reach = _angle(joints, bodies, joint, axis), _RETURN_RATE * dt
         if joints.slides[joint]:
-            place, step = wp.dot(_offset(joints, bodies.q, joint), axis), _CLOSING_SPEED * dt
-        lower_out[first] = wp.min(joints.lower[first], place + step)
-        upper_out[first] = wp.max(joints.upper[first], place - step)
+            position, reach = wp.dot(_offset(joints, bodies.q, joint), axis), _CLOSING_SPEED * dt
+        lower_out[first] = wp.min(joints.lower[first], position + reach)
+        upper_out[first] = wp.max(joints.upper[first], position - reach)
     if joints.pins[joint]:
         apart = _remaining_offset(joints, bodies, joint, dt)
-    aligned = wp.transform(wp.vec3(0.0), turn)
+    aligned = wp.transform(wp.vec3(0.0), rotation)
     parent_frame_out[joint] = wp.transform(apart, wp.quat_identity()) * joints.parent_frame[joint] * aligned
     child_frame_out[joint] = joints.child_frame[joint] * aligned
 
@@ -159,7 +159,7 @@ def launch_prepare_joints(joints: JointView, bodies: BodyView, dt: float, frames
     """Write the joint frames, axes and limits that Newton's kernel uses in a substep of ``dt`` [s].
 
     Frames of joints with one axis are rotated so that it is their x axis, because Newton applies limits only there.
-    Ends that are apart close, and joints outside of their limits return, at ``_CLOSING_SPEED`` and ``_RETURN_RATE`` at
+    Separated ends approach, and joints outside of their limits return, at ``_CLOSING_SPEED`` and ``_RETURN_RATE`` at
     most.
 
     Args:
@@ -262,7 +262,7 @@ def _add_drives(
     if mobility == 0.0:
         return
     speed = _row_speed(bodies, child, linear, angular1) - _row_speed(bodies, parent, linear, angular0)
-    # explicit where the substep resolves the spring, which keeps its oscillation, and implicit elsewhere:
+    # explicit where the substep resolves the spring, so that its oscillation is kept, and implicit elsewhere:
     # impulse = −dt (k (x + t v) + d (v − v₀)) with the time t between 0 and dt
     stiff = dt * dt * stiffness * mobility
     ahead = dt * stiff / (4.0 + stiff)
@@ -326,10 +326,10 @@ def launch_limit_recovery_speed(contacts: ContactView, bodies: BodyView, kinemat
 
 
 @wp.kernel
-def _count_down(left_out: wp.array[int]):
-    left_out[0] = left_out[0] - 1
+def _count_down(count_out: wp.array[int]):
+    count_out[0] = count_out[0] - 1
 
 
-def launch_count_down(left):
+def launch_count_down(count):
     """Decrement a counter, shape [1]."""
-    wp.launch(_count_down, dim=1, outputs=[left], device=left.device)
+    wp.launch(_count_down, dim=1, outputs=[count], device=count.device)

@@ -27,11 +27,12 @@ Nesterov momentum of an iteration."""
 _GROUPS = ((100, 32), (400, 16), (6_000, 8), (20_000, 4), (2**31, 2))
 """Threads of a GPU that share a body, as (most bodies, threads): fastest with three contacts per body on an H200."""
 _CLUSTER, _CLUSTER_CAPACITY, _SIDES_PER_BLOCK = 16, 50_000, 375
-"""Blocks of a cluster; most contacts that it lists; and most sides per block that it iterates over. With more, launches
-are faster: Balls Up (1,500 sides) takes a third of a launch, Falling Magnet (10,000) takes longer."""
+"""Blocks of a cluster; most contacts that it lists; and most sides per block that it iterates over. With more sides,
+launches are faster: a cluster takes a third of their time in Balls Up (1,500 sides), and longer in Falling Magnet
+(10,000)."""
 _WORLDS, _WORLD_GROUP, _WORLD_LINES = 16, 8, (32, 64, 128, 208)
-"""Worlds beyond which each has a block of its own; threads that share a body there; and possible numbers of bodies in a
-block's shared memory."""
+"""Number of worlds beyond which each has its own block; threads that share a body there; and possible numbers of bodies
+in a block's shared memory."""
 _BLOCK, _WIDE_BLOCKS = 128, 64  # threads of a block; and blocks for wide bodies, which a whole block shares
 _WIDE = 16, 4, 64
 """A body is wide with more contacts than 16 + 4 for each thread of its group, 64 at most. A solve of Letters, with up
@@ -39,7 +40,7 @@ to 140 contacts per body, takes 0.12 ms on an H200, and 0.14 ms without wide bod
 _CONTACTS_PER_THREAD = 100  # fewest contacts per thread of a CPU: an iteration over them takes 1 to 2 µs
 _ROUND_TOLERANCE = 1e-6  # relative difference of inverse inertias up to which a body counts as round: float32 rounding
 _CONTACT_SIZE, _RETURN_SIZE, _IMPULSE_SIZE, _RECORD_SIZE, _KEPT_SIZE = 20, 8, 12, 8, 9
-"""Numbers of a contact, its return velocity, its accumulated impulse, a record, and a kept slip; as in
+"""Sizes, in numbers, of a contact, its return velocity, its accumulated impulse, a record and a kept slip; as in
 ``solve_arrays.h``."""
 _TOTALS, _UNSOLVED = 6, 4
 """Number of totals, and index of the bodies that a cluster leaves to launches; as in ``solve_cuda.h``."""
@@ -85,7 +86,7 @@ class SolveArrays:
     q: wp.uint64
     qd: wp.uint64
     # work
-    shares: wp.uint64  # number of shares that mass splitting divides each body into, shape [b]; none for whole bodies
+    shares: wp.uint64  # number of shares that mass splitting divides each body into, shape [b]; 0 for whole bodies
     # GPU: numbers of bodies and sides that take part, of immovable, wide and unsolved bodies, and 1 if a contact has
     # friction, shape [6]. Launches solve the bodies that a cluster leaves unsolved.
     totals: wp.uint64
@@ -94,11 +95,11 @@ class SolveArrays:
     slot: wp.uint64  # line of each body, shape [b]
     body: wp.uint64  # body of each line, -1 for the world, shape [l]
     range: wp.uint64  # first of the sides of a line's body, and the one after the last, shape [l, 2]
-    entry: wp.uint64  # GPU: side as twice its contact plus its end, by body, shape [2P]. CPU: contacts that take part
+    entry: wp.uint64  # GPU: 2 c + end for each side of contact c, by body, shape [2P]. CPU: contacts of movable bodies
     # GPU: line of the other body, then contact of each side, shape [2, 2c]. CPU: lines of the first and second body,
     # then their records, shape [P / CHUNK, 4, CHUNK].
     other: wp.uint64
-    quiet: wp.uint64  # CPU: 1 for each vector of contacts whose records are zero, shape [P / CHUNK]
+    records_zero: wp.uint64  # CPU: 1 for each vector of contacts whose records are zero, shape [P / CHUNK]
     wide: wp.uint64  # GPU: lines of wide bodies, shape [b]
     world_first: wp.uint64  # first body of each world that has a block, and the one after the last, shape [worlds + 1]
     kept_range: wp.uint64  # range of the sides of each body in the last substep, shape [b, 2]
@@ -113,7 +114,7 @@ class SolveArrays:
     # CPU: impulse of an iteration on each side, by body, and one for the immovable bodies of each vector, shape
     # [2P + P / CHUNK, 8].
     record: wp.uint64
-    kept: wp.uint64  # their slip [m, rad], and their point on the body of the first shape [m], shape [2P, 9]
+    kept: wp.uint64  # slips of those sides [m, rad], and points on the bodies of the first shapes [m], shape [2P, 9]
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ class SolveBuffers:
 
 
 def allocate(contact_max: int, bodies: BodyView, *, kinematic_flag: int) -> SolveBuffers:
-    """Return the buffers for at most ``contact_max`` contacts; ``kinematic_flag`` is Newton's flag of such bodies."""
+    """Return the buffers for at most ``contact_max`` contacts; ``kinematic_flag`` is Newton's for kinematic ones."""
     device, inertia = bodies.inv_mass.device, bodies.inv_inertia.numpy()
     world_first, world_lines = _split_worlds(bodies)
     body_count = len(inertia)
@@ -187,7 +188,7 @@ def _allocate_work(contact_max: int, body_count: int, device) -> dict[str, wp.ar
         "range": integers(line_count, 2),
         "entry": integers(2 * padded),
         "other": integers(4 * padded),
-        "quiet": integers(on_cpu * padded // CHUNK),
+        "records_zero": integers(on_cpu * padded // CHUNK),
         "wide": integers(on_gpu * body_count),
         "kept_range": integers(max(body_count, 1), 2),
         "key": keys(on_gpu * 2 * padded),
@@ -204,13 +205,13 @@ def _allocate_work(contact_max: int, body_count: int, device) -> dict[str, wp.ar
 
 
 def _split_worlds(bodies: BodyView) -> tuple[np.ndarray, int]:
-    """Return the first body of each world, and the bodies that a block has to hold, 0 where worlds have no blocks."""
+    """Return the first body of each world, and the number of bodies that a block holds, 0 if worlds have no blocks."""
     world, movable = bodies.world.numpy(), bodies.inv_mass.numpy() > 0.0
     so_far = np.maximum.accumulate(world)
     first = np.searchsorted(so_far, np.arange(world.max(initial=-1) + 2))
     lines = next((lines for lines in _WORLD_LINES if lines >= np.diff(first).max(initial=0)), 0)
-    suited = len(first) > _WORLDS and ((world == so_far) | ((world < 0) & ~movable)).all()
-    return first, lines if suited and bodies.inv_mass.device.is_cuda and not movable[world < 0].any() else 0
+    separate = len(first) > _WORLDS and ((world == so_far) | ((world < 0) & ~movable)).all()
+    return first, lines if separate and bodies.inv_mass.device.is_cuda and not movable[world < 0].any() else 0
 
 
 def _most_blocks(device, is_round: bool, group: int) -> int:
@@ -305,9 +306,9 @@ def launch_solve_contacts(
     device = counters.device
     _set_views(a, contacts, bodies, shares)
 
-    def launch(call, dim, number=0, blocks=0, limit=0, **form):
+    def launch(call, dim, number=0, blocks=0, limit=0, **variant):
         inputs = [a, number, relaxation, dt, limit or buffers.limit, team() if device.is_cpu else None]
-        kernel, block = solve_kernel(call, buffers.round, buffers.group, **form)
+        kernel, block = solve_kernel(call, buffers.round, buffers.group, **variant)
         wp.launch(kernel, dim or blocks * block, inputs=inputs, device=device, block_dim=block)
 
     if device.is_cpu:

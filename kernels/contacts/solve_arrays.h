@@ -22,7 +22,8 @@ struct Arrays {
     Real* qd;
     // work
     const Real* shares;
-    int *totals, *side_count, *filled, *slot, *body, *range, *entry, *other, *quiet, *wide, *world_first, *kept_range;
+    int *totals, *side_count, *filled, *slot, *body, *range, *entry, *other, *records_zero, *wide, *world_first,
+        *kept_range;
     unsigned long long *key, *kept_key;
     Real *motion, *next_motion, *pose, *side, *return_velocity, *impulse, *record, *kept;
 
@@ -41,11 +42,11 @@ struct Arrays {
     CUDA_CALLABLE bool has_friction(int c) const { return mu[shape0[c]] + mu[shape1[c]] > 0; }
 };
 
-// Numbers of a contact, its return velocity, its accumulated impulse, a record, and a kept slip.
+// Sizes, in numbers, of a contact, its return velocity, its accumulated impulse, a record and a kept slip.
 constexpr int CONTACT_SIZE = 20, RETURN_SIZE = 8, IMPULSE_SIZE = 12, RECORD_SIZE = 8, KEPT_SIZE = 9;
 
-// Functions that read and write by fours. Their argument is a function that reads or writes quarter q of a line, four
-// numbers.
+// Functions that read and write four numbers at a time. Their argument is a function that reads or writes quarter q of
+// a line.
 template <class Fours> CUDA_CALLABLE inline Body read_body(Fours motion) {
     const Four a = motion(0), b = motion(1);
     return {{a.x, a.y, a.z}, {b.x, b.y, b.z}, a.w, b.w};
@@ -115,7 +116,7 @@ CUDA_CALLABLE inline Vector centers_of_mass(const Arrays& a, int i) {
     return vectors(row, WIDTH);
 }
 
-// Fills lines i with their bodies as they are before the solve. Lines without a body are filled with the world.
+// Loads the bodies of lines i in their state before the solve. Lines without a body get the values of the world.
 CUDA_CALLABLE inline void load_lines(const Arrays& a, int i) {
     for (int l = 0; l < WIDTH; ++l) {
         const int b = a.body[i + l];
@@ -161,33 +162,33 @@ CUDA_CALLABLE inline void store_velocities(const Arrays& a, const Body& body, in
     }
 }
 
-// Finds the two bodies of contact c; returns false where it can move neither.
+// Finds the two bodies of contact c. Returns true if they differ and at least one of them is movable.
 CUDA_CALLABLE inline bool find_bodies(const Arrays& a, int c, int (&ends)[2]) {
     ends[0] = a.body_of_shape(a.shape0[c]), ends[1] = a.body_of_shape(a.shape1[c]);
     return ends[0] != ends[1] && (a.movable(ends[0]) || a.movable(ends[1]));
 }
 
 // Writes detected contact c, with the body of shape ``end`` as its own body; the numbers are ``stride`` apart.
-CUDA_CALLABLE inline void write_detected(const Arrays& a, int c, int end, Real* place, int stride) {
+CUDA_CALLABLE inline void write_detected(const Arrays& a, int c, int end, Real* out, int stride) {
     const int shapes[2] = {a.shape0[c], a.shape1[c]};
     const Real* const points[2] = {a.point0 + 3 * (size_t)c, a.point1 + 3 * (size_t)c};
     const Real* const offsets[2] = {a.offset0 + 3 * (size_t)c, a.offset1 + 3 * (size_t)c};
-    for (int row = 0; row < 2; ++row) {
-        const int from = row == 0 ? end : 1 - end, b = a.body_of_shape(shapes[from]);
+    for (int row = 0; row < 2; ++row) { // own body, then the other one
+        const int row_end = row == 0 ? end : 1 - end, b = a.body_of_shape(shapes[row_end]);
         for (int k = 0; k < 3; ++k) {
-            const Real point = points[from][k] - (b < 0 ? 0 : a.com[3 * (size_t)b + k]);
-            place[(4 * row + k) * stride] = point;
-            place[(4 * (row + 2) + k) * stride] = point + offsets[from][k];
+            const Real point = points[row_end][k] - (b < 0 ? 0 : a.com[3 * (size_t)b + k]);
+            out[(4 * row + k) * stride] = point;
+            out[(4 * (row + 2) + k) * stride] = point + offsets[row_end][k];
         }
     }
-    for (int k = 0; k < 3; ++k) place[(16 + k) * stride] = (end == 1 ? 1 : -1) * a.normal[3 * (size_t)c + k];
+    for (int k = 0; k < 3; ++k) out[(16 + k) * stride] = (end == 1 ? 1 : -1) * a.normal[3 * (size_t)c + k];
     auto mean = [&](const Real* of_shape) { return Real(0.5) * (of_shape[shapes[0]] + of_shape[shapes[1]]); };
-    place[3 * stride] = a.margin0[c] + a.margin1[c];
-    place[7 * stride] = mean(a.mu);
-    place[11 * stride] = mean(a.mu_torsional);
-    place[15 * stride] = mean(a.mu_rolling);
+    out[3 * stride] = a.margin0[c] + a.margin1[c];
+    out[7 * stride] = mean(a.mu);
+    out[11 * stride] = mean(a.mu_torsional);
+    out[15 * stride] = mean(a.mu_rolling);
     const int own_body = a.body_of_shape(shapes[end]), other_body = a.body_of_shape(shapes[1 - end]);
-    place[19 * stride] = a.is_kinematic(own_body) + 2 * a.is_kinematic(other_body);
+    out[19 * stride] = a.is_kinematic(own_body) + 2 * a.is_kinematic(other_body);
 }
 
 // Stores the range of the kept sides of body b.
@@ -202,9 +203,9 @@ CUDA_CALLABLE inline void keep_slip(const Arrays& a, int place, int c, const Rea
     for (int k = 0; k < 3; ++k) kept[6 + k] = a.point0[3 * (size_t)c + k];
     a.kept_key[place] = a.pair_key(c);
 }
-// Reads the slip that contact c had accumulated on its second body at the end of the last substep. Where the shapes
-// touched at several points, the nearest one counts. The slip is 0 where they did not touch, and where it is not
-// finite, as after a failed attempt at a step.
+// Reads the slip that contact c had accumulated on its second body at the end of the last substep. If the shapes
+// touched at several points, the slip of the nearest point is read. The slip is 0 if they did not touch, or if the kept
+// slip is not finite, as after a failed attempt at a step.
 CUDA_CALLABLE inline void read_kept_slip(const Arrays& a, int c, Real (&slip)[6]) {
     for (Real& component : slip) component = 0;
     if (!a.has_friction(c)) return;
@@ -214,10 +215,10 @@ CUDA_CALLABLE inline void read_kept_slip(const Arrays& a, int c, Real (&slip)[6]
         for (int k = 0; k < 2 && a.movable(ends[end]); ++k) ranges[end][k] = a.kept_range[2 * (size_t)ends[end] + k];
     // the lists of both bodies hold the contact: search the shorter one
     const int counts[2] = {ranges[0][1] - ranges[0][0], ranges[1][1] - ranges[1][0]};
-    const int from = !a.movable(ends[0]) || (a.movable(ends[1]) && counts[1] <= counts[0]);
+    const int searched = !a.movable(ends[0]) || (a.movable(ends[1]) && counts[1] <= counts[0]);
     const Real* nearest = nullptr;
     Real least = Real(1e30);
-    for (int place = ranges[from][0]; place < ranges[from][1]; ++place) {
+    for (int place = ranges[searched][0]; place < ranges[searched][1]; ++place) {
         if (a.kept_key[place] != a.pair_key(c)) continue;
         const Real* const kept = a.kept + KEPT_SIZE * (size_t)place;
         Real square = 0;
@@ -229,6 +230,6 @@ CUDA_CALLABLE inline void read_kept_slip(const Arrays& a, int c, Real (&slip)[6]
     }
     Real size = 0;
     for (int k = 0; k < 6 && nearest; ++k) size += nearest[k] < 0 ? -nearest[k] : nearest[k];
-    for (int k = 0; k < 6 && nearest && size < Real(1e30); ++k) slip[k] = from ? nearest[k] : -nearest[k];
+    for (int k = 0; k < 6 && nearest && size < Real(1e30); ++k) slip[k] = searched ? nearest[k] : -nearest[k];
 }
 }

@@ -10,8 +10,8 @@
 #if defined(__CUDA_ARCH__)
 namespace warpmag {
 
-// Quarters of a line for each body in shared memory: two of its motion before and after an iteration, two of its
-// inertia.
+// Quarters that shared memory holds for each body: two for its motion before an iteration, two for its motion after
+// it, and two for its inertia.
 constexpr int QUARTERS = 6;
 
 // A body that a block solves.
@@ -105,13 +105,13 @@ struct WorldPlan {
     }
 };
 
-// A side, and the offset between the two motions of its other body, 0 for an immovable body.
-struct KeptSide {
+// A side that a thread holds, and the offset between the two motions of its other body, 0 for an immovable body.
+struct HeldSide {
     Side side;
     int step;
 };
 template <class Plan>
-__device__ inline KeptSide side_of(const Arrays& a, const Plan& plan, BlockMemory& memory, int k, bool frictional) {
+__device__ inline HeldSide side_of(const Arrays& a, const Plan& plan, BlockMemory& memory, int k, bool frictional) {
     const int j = a.other[k];
     const Contact contact = contact_at(a, k, frictional);
     if (j >= plan.bodies) return {{contact, line_at(a, a.motion, j)}, 0};
@@ -120,25 +120,25 @@ __device__ inline KeptSide side_of(const Arrays& a, const Plan& plan, BlockMemor
 }
 
 // Performs all iterations of a block's tasks, and keeps the slip of their contacts for the next substep. Before even
-// iterations motions are in the first two quarters of a body, before odd ones in the next two.
+// iterations motions are in the first two quarters of a line, before odd ones in the next two.
 template <class Plan>
 __device__ inline void iterate_all(const Arrays& a, const Plan& plan, BlockMemory& memory, int tasks, int iterations,
                                    Real relaxation, Real dt) {
     const int teams = plan.is_wide() ? 1 : BLOCK / GROUP, members = BLOCK / teams;
     const int team = threadIdx.x / members, first = threadIdx.x % members;
     const bool frictional = a.totals[FRICTIONAL];
-    int kept_at = -1;
-    KeptSide kept = {};
-    AccumulatedImpulse kept_impulse = {};
+    int held_index = -1;
+    HeldSide held = {};
+    AccumulatedImpulse held_impulse = {};
     if (team < tasks) {
         const int2 sides = memory.tasks[team].sides;
         const bool taken = plan.is_wide() || sides.y - sides.x <= WIDE;
         if (taken && sides.x + first < sides.y)
-            kept_at = sides.x + first, kept = side_of(a, plan, memory, kept_at, frictional);
+            held_index = sides.x + first, held = side_of(a, plan, memory, held_index, frictional);
     }
     auto side_before = [&](int k, int iteration) {
-        KeptSide read = kept;
-        if (k != kept_at) read = side_of(a, plan, memory, k, frictional);
+        HeldSide read = held;
+        if (k != held_index) read = side_of(a, plan, memory, k, frictional);
         else read.side.contact.return_velocity = return_velocity_at(a, k, frictional); // saves registers
         read.side.other.motion += iteration % 2 * read.step;
         return read.side;
@@ -150,17 +150,17 @@ __device__ inline void iterate_all(const Arrays& a, const Plan& plan, BlockMemor
         const int odd = iteration % 2;
         auto side_at = [&](int k) { return side_before(k, iteration); };
         auto update_at = [&](int k, auto update) {
-            if (k == kept_at) return update(kept_impulse);
+            if (k == held_index) return update(held_impulse);
             AccumulatedImpulse impulse = impulse_at(a, k);
             const Impulse added = update(impulse);
             write_impulse_of(a, k, impulse);
             return added;
         };
-        auto totals = [&](int sides, ImpulseSum p) { return plan.is_wide() ? block_sums(p, sides) : p; };
+        auto sum_threads = [&](int sides, ImpulseSum p) { return plan.is_wide() ? block_sums(p, sides) : p; };
         for (int t = team; t < tasks; t += teams) {
             Four* const line = line_of(t);
             move_body({line + 2 * odd, line + 4}, line + 2 * (1 - odd), memory.tasks[t].sides, true, first, members,
-                      side_at, update_at, totals, momentum_at(iteration, iterations));
+                      side_at, update_at, sum_threads, momentum_at(iteration, iterations));
         }
         cluster_barrier();
     }
@@ -172,7 +172,7 @@ __device__ inline void iterate_all(const Arrays& a, const Plan& plan, BlockMemor
         keep_sides(
             a, read_body([&](int quarter) { return motion[quarter]; }), sides.x + first, sides.y, members,
             [&](int k) { return side_before(k, iterations); },
-            [&](int k) { return k == kept_at ? kept_impulse : impulse_at(a, k); }, relaxation, dt);
+            [&](int k) { return k == held_index ? held_impulse : impulse_at(a, k); }, relaxation, dt);
     }
     cluster_barrier(); // no block exits while others read its lines
 }
@@ -195,13 +195,13 @@ __device__ inline void solve_tasks(const Arrays& a, const Plan& plan, BlockMemor
     }
 }
 
-// Solves a scene in one launch. With more than ``most`` sides, or more bodies than fit, it only makes the lists and
-// sets ``totals[UNSOLVED]``.
-__device__ inline void solve_in_cluster(const Arrays& a, int iterations, int most, Real relaxation, Real dt) {
+// Solves a scene in one launch. With more than ``most_sides`` sides, or more bodies than fit, it only makes the lists
+// and sets ``totals[UNSOLVED]``.
+__device__ inline void solve_in_cluster(const Arrays& a, int iterations, int most_sides, Real relaxation, Real dt) {
     __shared__ BlockMemory memory;
     build_lists(a, relaxation, dt);
     const ClusterPlan plan(a);
-    const bool fits = plan.fits() && a.totals[SIDES] <= most;
+    const bool fits = plan.fits() && a.totals[SIDES] <= most_sides;
     if (!fits && threadIdx.x == 0 && plan.block == 0) a.totals[UNSOLVED] = plan.bodies;
     if (fits && plan.bodies > 0) solve_tasks(a, plan, memory, iterations, relaxation, dt);
 }

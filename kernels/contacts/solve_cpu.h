@@ -10,7 +10,7 @@ namespace warpmag {
 
 inline int rounded(int count) { return (count + WIDTH - 1) / WIDTH * WIDTH; }
 
-// Numbers of contacts, of movable bodies and of lines that take part, and whether any contact has friction.
+// Numbers of contacts, movable bodies and lines in the solve; ``frictional`` is true if any contact has friction.
 struct Lists {
     int contacts, bodies, lines;
     bool frictional;
@@ -45,23 +45,23 @@ inline Lists list_contacts(const Arrays& a) {
     return lists;
 }
 
-// Writes the listed contacts in vectors, with the second body as own body. The last vector is padded with contacts that
-// stay open.
+// Writes the listed contacts in vectors, with the second body as own body. The last vector is padded with open
+// contacts, which receive no impulse.
 inline void write_contacts(const Arrays& a, const Lists& lists) {
     for (int k = 0; k < rounded(lists.contacts); ++k) {
-        Real* const place = rows_at(a.side, CONTACT_SIZE, k);
+        Real* const contact = rows_at(a.side, CONTACT_SIZE, k);
         int* const other = list_at(a.other, 4, 0, k);
         for (int end = 0; end < 2; ++end) {
             other[end * CHUNK] = a.line_count - 1;
             other[(2 + end) * CHUNK] = 2 * a.contact_max + k / WIDTH; // record of an immovable body
         }
         for (int r = 0; r < IMPULSE_SIZE; ++r) rows_at(a.impulse, IMPULSE_SIZE, k)[r * CHUNK] = 0;
-        a.quiet[k / WIDTH] = 0;
+        a.records_zero[k / WIDTH] = 0;
         if (k >= lists.contacts) {
-            for (int r = 0; r < CONTACT_SIZE; ++r) place[r * CHUNK] = r == 3 ? -1 : 0;
+            for (int r = 0; r < CONTACT_SIZE; ++r) contact[r * CHUNK] = r == 3 ? -1 : 0;
             continue;
         }
-        write_detected(a, a.entry[k], 1, place, CHUNK);
+        write_detected(a, a.entry[k], 1, contact, CHUNK);
         int ends[2];
         find_bodies(a, a.entry[k], ends);
         for (int end = 0; end < 2; ++end) {
@@ -154,11 +154,11 @@ inline void iterate_contacts(const Arrays& a, int k, bool frictional, Real momen
     AccumulatedImpulse impulse = read_impulse(rows_of(rows));
     const Impulse added = iterate_contact(c, p.own, p.other, impulse, momentum);
     // after an iteration that added nothing, the records are zero and need not be written again
-    int& quiet = a.quiet[k / WIDTH];
+    int& zero = a.records_zero[k / WIDTH];
     const bool adds = any(dot(added.linear, added.linear) + dot(added.angular, added.angular) != 0);
     write_impulse(impulse, put_rows(rows));
-    if (!adds && quiet) return;
-    quiet = !adds;
+    if (!adds && zero) return;
+    zero = !adds;
     write_records(a, k, added.linear, own_angular_impulse(c, added), other_angular_impulse(c, added));
 }
 

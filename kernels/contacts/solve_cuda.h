@@ -111,8 +111,8 @@ __device__ inline void write_side(int k, const Arrays& a, Real relaxation, Real 
     contact_of(a, place) = c;
     Real s[6];
     read_kept_slip(a, c, s);
-    const Real from = end == 1 ? 1 : -1;
-    const Slip slip = {{from * s[0], from * s[1], from * s[2]}, {from * s[3], from * s[4], from * s[5]}};
+    const Real sign = end == 1 ? 1 : -1;
+    const Slip slip = {{sign * s[0], sign * s[1], sign * s[2]}, {sign * s[3], sign * s[4], sign * s[5]}};
     auto fours = [](const Real* lines, int i) { return [=](int quarter) { return own_four(lines, quarter, i); }; };
     const auto own_motion = fours(a.motion, slot), other_motion = fours(a.motion, other);
     const DetectedContact side = read_detected(
@@ -172,11 +172,11 @@ __device__ inline ImpulseSum sum_impulses(Sides side_at, Updates update_at, int 
 }
 
 // Sum over a block of the sums of its groups; the first ``sides`` threads had contacts.
-__device__ inline ImpulseSum block_sums(ImpulseSum mine, int sides) {
+__device__ inline ImpulseSum block_sums(ImpulseSum group_sum, int sides) {
     constexpr int GROUPS = BLOCK / GROUP;
     __shared__ ImpulseSum parts[GROUPS];
     __syncthreads();
-    if (share() == 0) parts[threadIdx.x / GROUP] = mine;
+    if (share() == 0) parts[threadIdx.x / GROUP] = group_sum;
     __syncthreads();
     ImpulseSum total = parts[0];
     for (int g = 1; g < GROUPS && g * GROUP < sides; ++g) {
@@ -188,21 +188,21 @@ __device__ inline ImpulseSum block_sums(ImpulseSum mine, int sides) {
 
 // Performs an iteration of the body of a line, shared by ``threads`` threads; ``first`` is the number of this one. A
 // group of GROUP threads skips bodies of more than WIDE contacts, which a whole block solves.
-template <class Sides, class Updates, class Totals>
-__device__ inline void move_body(const Line& line, Four* to, int2 sides, bool taken, int first, int threads,
-                                 Sides side_at, Updates update_at, Totals totals, Real momentum) {
+template <class Sides, class Updates, class SumThreads>
+__device__ inline void move_body(const Line& line, Four* motion_out, int2 sides, bool valid, int first, int threads,
+                                 Sides side_at, Updates update_at, SumThreads sum_threads, Real momentum) {
     Body own = read_body([&](int quarter) { return line.motion[quarter]; });
     const Inertia inertia = read_inertia([&](int quarter) { return line.inertia[quarter - 2]; });
     // the reads above are issued together, before it is known whether they are needed
-    if (!taken || (threads == GROUP && sides.y - sides.x > WIDE)) return;
-    const ImpulseSum p =
-        totals(sides.y - sides.x, sum_impulses(side_at, update_at, sides.x + first, sides.y, threads, own, momentum));
+    if (!valid || (threads == GROUP && sides.y - sides.x > WIDE)) return;
+    const ImpulseSum p = sum_threads(
+        sides.y - sides.x, sum_impulses(side_at, update_at, sides.x + first, sides.y, threads, own, momentum));
     apply_impulse(own, inertia, p.linear, p.angular);
-    if (first == 0) write_body((Real*)to, 0, own);
+    if (first == 0) write_body((Real*)motion_out, 0, own);
 }
 
-// Calls act(slot, taken, first, threads) for the body that a group of threads shares. The first WIDE_BLOCKS blocks take
-// the bodies of more than WIDE contacts, one at a time for a whole block.
+// Calls act(slot, valid, first, threads) for the body that a group of threads shares; ``valid`` is false without one.
+// The first WIDE_BLOCKS blocks take the bodies of more than WIDE contacts, one at a time for a whole block.
 template <class Act> __device__ inline void for_each_body(int thread, const Arrays& a, Act act) {
     const int block = thread / BLOCK;
     if (block < WIDE_BLOCKS) {
@@ -225,10 +225,10 @@ __device__ inline void iterate(int thread, const Arrays& a, int iteration, int i
         write_impulse_of(a, k, impulse);
         return added;
     };
-    for_each_body(thread, a, [&](int slot, bool taken, int first, int threads) {
-        auto totals = [&](int sides, ImpulseSum p) { return threads == GROUP ? p : block_sums(p, sides); };
-        move_body(line_at(a, from, slot), to + 4 * (size_t)slot, ((const int2*)a.range)[slot], taken, first, threads,
-                  side_at, update_at, totals, momentum_at(iteration, iterations));
+    for_each_body(thread, a, [&](int slot, bool valid, int first, int threads) {
+        auto sum_threads = [&](int sides, ImpulseSum p) { return threads == GROUP ? p : block_sums(p, sides); };
+        move_body(line_at(a, from, slot), to + 4 * (size_t)slot, ((const int2*)a.range)[slot], valid, first, threads,
+                  side_at, update_at, sum_threads, momentum_at(iteration, iterations));
     });
 }
 
@@ -251,8 +251,8 @@ __device__ inline void finish_body(const Arrays& a, int slot, int2 sides, const 
 }
 __device__ inline void finish(int thread, const Arrays& a, int odd, Real relaxation, Real dt) {
     const Real* const lines = odd ? a.next_motion : a.motion;
-    for_each_body(thread, a, [&](int slot, bool taken, int first, int threads) {
-        if (!taken) return;
+    for_each_body(thread, a, [&](int slot, bool valid, int first, int threads) {
+        if (!valid) return;
         const int2 sides = ((const int2*)a.range)[slot];
         if (threads == GROUP && sides.y - sides.x > WIDE) return;
         const Line line = line_at(a, lines, slot);

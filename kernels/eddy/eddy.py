@@ -68,7 +68,7 @@ def _arrays_type(dtype):
         torque_slot: wp.array[int]
         torque_chunk: wp.array[wp.vec4i]  # number of balls, range of conductors of their world
         conductor: wp.array[int]  # moment of each conductor
-        number: wp.array[int]  # conductor of each inducible ball, or -1
+        torque_conductor: wp.array[int]  # conductor of each inducible ball, or -1
         # Model: material of each moment
         conductivity: wp.array[dtype]  # [S/m]
         inducible: wp.array[int]
@@ -102,7 +102,7 @@ def _field_readers(dtype):
     vec3, mat33 = wp.types.vector(3, dtype), wp.types.matrix((3, 3), dtype)
 
     @wp.func
-    def three(rows: wp.array2d[dtype], row: int, i: int):
+    def vector_at(rows: wp.array2d[dtype], row: int, i: int):
         return vec3(rows[row, i], rows[row + 1, i], rows[row + 2, i])
 
     @wp.func
@@ -111,17 +111,17 @@ def _field_readers(dtype):
         xy, yz, zx = at_conductor[9, i], at_conductor[10, i], at_conductor[11, i]
         return mat33(xx, xy, zx, xy, yy, yz, zx, yz, zz)
 
-    return three, gradient
+    return vector_at, gradient
 
 
 @cache
-def _brake_kernel(dtype):
+def _eddy_kernel(dtype):
     vec3, eddy_arrays = wp.types.vector(3, dtype), _arrays_type(dtype)
-    three, gradient = _field_readers(dtype)
+    vector_at, gradient = _field_readers(dtype)
     coefficient, two_thirds, mu0, inverse_4pi = (dtype(x) for x in (2.0 * np.pi / 15.0, 2.0 / 3.0, MU0, INVERSE_4PI))
 
     @wp.kernel(module="unique", enable_backward=False, module_options=native_options("material/curves.h", dtype=dtype))
-    def brake(
+    def add_eddy_moments(
         arrays: eddy_arrays,
         applied: wp.array[vec3],
         applied_rates: wp.array[vec3],
@@ -133,8 +133,8 @@ def _brake_kernel(dtype):
     ):
         slot = arrays.slot[wp.tid()]
         i = arrays.ball[slot]
-        h = inverse_4pi * three(arrays.at_conductor, 0, slot) + applied[i]
-        rate = inverse_4pi * three(arrays.at_conductor, 3, slot) - wp.cross(three(arrays.motion, 3, i), h)
+        h = inverse_4pi * vector_at(arrays.at_conductor, 0, slot) + applied[i]
+        rate = inverse_4pi * vector_at(arrays.at_conductor, 3, slot) - wp.cross(vector_at(arrays.motion, 3, i), h)
         t = inverse_4pi * gradient(arrays.at_conductor, slot)
         if applied_rates:
             rate += applied_rates[i]
@@ -162,26 +162,26 @@ def _brake_kernel(dtype):
             if effective:
                 effective[n, i] = effective[n, i] + e[n]
 
-    return brake
+    return add_eddy_moments
 
 
 @cache
-def _turn_kernel(dtype):
+def _torque_kernel(dtype):
     vec3, eddy_arrays = wp.types.vector(3, dtype), _arrays_type(dtype)
-    three, _ = _field_readers(dtype)
+    vector_at, _ = _field_readers(dtype)
     mu0, inverse_4pi = dtype(MU0), dtype(INVERSE_4PI)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def turn(arrays: eddy_arrays, torques: wp.array[vec3]):
+    def add_torques(arrays: eddy_arrays, torques: wp.array[vec3]):
         slot = arrays.torque_slot[wp.tid()]
         i = arrays.torque_ball[slot]
-        torque = wp.cross(three(arrays.packed, 4, i), inverse_4pi * three(arrays.field, 0, slot))
-        conductor = arrays.number[wp.tid()]
+        torque = wp.cross(vector_at(arrays.packed, 4, i), inverse_4pi * vector_at(arrays.field, 0, slot))
+        conductor = arrays.torque_conductor[wp.tid()]
         if conductor >= 0:
-            torque += wp.cross(three(arrays.eddy, 0, i), arrays.h[conductor])
+            torque += wp.cross(vector_at(arrays.eddy, 0, i), arrays.h[conductor])
         torques[i] += mu0 * torque
 
-    return turn
+    return add_torques
 
 
 @cache
@@ -230,12 +230,12 @@ class EddyCurrents:
         ]
         ends = np.cumsum([0, *map(len, balls)])
         conductors = self._lay_out("ball", "chunk", "slot", balls, ranges)
-        number = np.full(packed.count, -1)
-        number[conductors] = np.arange(len(conductors))
+        conductor_of_moment = np.full(packed.count, -1)
+        conductor_of_moment[conductors] = np.arange(len(conductors))
         conductor_ranges = itertools.pairwise(ends)
         inducible = self._lay_out("torque_ball", "torque_chunk", "torque_slot", torque_balls, conductor_ranges)
         self._put("conductor", conductors)
-        self._put("number", number[inducible])
+        self._put("torque_conductor", conductor_of_moment[inducible])
         arrays.at_conductor = wp.zeros((_FIELD_ROWS, len(arrays.ball)), dtype=dtype, device=device)
         arrays.field = wp.zeros((3, len(arrays.torque_ball)), dtype=dtype, device=device)
         arrays.h = wp.zeros(len(conductors), dtype=wp.types.vector(3, dtype), device=device)
@@ -277,11 +277,11 @@ class EddyCurrents:
         self._make_pass(_RATES, len(self._arrays.ball))
         changes = (sources.rates, *sources.along) if sources else (None,) * 4
         inputs = [self._arrays, applied, *changes, self._step, effective]
-        wp.launch(_brake_kernel(self._packed.dtype), len(self._arrays.slot), inputs=inputs, device=self._device)
+        wp.launch(_eddy_kernel(self._packed.dtype), len(self._arrays.slot), inputs=inputs, device=self._device)
 
     def finish(self, moments, torques):
         """Add the torques [N·m] on inducible balls, and restore the packed moments without eddy moments."""
         arrays, dtype, device = self._arrays, self._packed.dtype, self._device
         self._make_pass(_FIELDS, len(arrays.torque_ball))
-        wp.launch(_turn_kernel(dtype), len(arrays.torque_slot), inputs=[arrays, torques], device=device)
+        wp.launch(_torque_kernel(dtype), len(arrays.torque_slot), inputs=[arrays, torques], device=device)
         wp.launch(_restore_kernel(dtype), len(arrays.slot), inputs=[arrays, moments], device=device)

@@ -34,10 +34,10 @@ struct MomentColumns {
         : data(rows.data), pitch(rows.strides[0] / sizeof(Real)) {}
     CUDA_CALLABLE Real at(int row, int j) const { return data[row * pitch + j]; }
     CUDA_CALLABLE Number own(int row, const int* i) const { return gather(data + row * pitch, i); }
-    CUDA_CALLABLE Vector own_three(int row, const int* i) const {
+    CUDA_CALLABLE Vector own_vector_at(int row, const int* i) const {
         return {own(row, i), own(row + 1, i), own(row + 2, i)};
     }
-    CUDA_CALLABLE Vector three(int row, int j) const {
+    CUDA_CALLABLE Vector vector_at(int row, int j) const {
         const Number zero = Number(Real(0));
         return {zero + at(row, j), zero + at(row + 1, j), zero + at(row + 2, j)};
     }
@@ -54,7 +54,7 @@ struct FieldAtBall {
 CUDA_CALLABLE inline void add_source(FieldAtBall& at_ball, const MomentColumns& packed, const MomentColumns& motion,
                                      int j, Vector x, Number radius, Vector velocity, Mask active) {
     const Number zero = Number(Real(0)), other = zero + packed.at(3, j), s = radius + other, s2 = s * s;
-    const Vector r = x - packed.three(0, j), m = packed.three(4, j), w = cross(motion.three(3, j), m);
+    const Vector r = x - packed.vector_at(0, j), m = packed.vector_at(4, j), w = cross(motion.vector_at(3, j), m);
     const Number d2 = dot(r, r), c = larger(d2, s2);
     const Number i = (active & (c > zero)) ? Real(0.5) * twice_inverse_root(c) : zero, i2 = i * i, i3 = i2 * i;
     const Number g2 = 3 * i2 * i3;
@@ -70,7 +70,7 @@ CUDA_CALLABLE inline void add_source(FieldAtBall& at_ball, const MomentColumns& 
         add(t, gradient_of(u, p.m, overlapping ? g : 0, overlapping ? g3 * dot(p.u, p.m) : 0));
     }
     at_ball.h += h;
-    at_ball.rate += (t * (velocity - motion.three(0, j)) + h_w);
+    at_ball.rate += (t * (velocity - motion.vector_at(0, j)) + h_w);
     add(at_ball.t, t);
     const Real scale = MU0_4PI * MU0_4PI;
     at_ball.decay += (scale * motion.at(6, j)) * square(t) + (scale * motion.at(7, j)) * dot(h, h);
@@ -82,7 +82,7 @@ template <class Arrays> CUDA_CALLABLE inline void rates_at(const Arrays& arrays,
     const MomentColumns packed(arrays.packed), motion(arrays.motion);
     const int* const own = arrays.ball.data + slot;
     const Number zero = Number(Real(0)), radius = packed.own(3, own), label = packed.own(7, own);
-    const Vector zeros = {zero, zero, zero}, x = packed.own_three(0, own), velocity = motion.own_three(0, own);
+    const Vector zeros = {zero, zero, zero}, x = packed.own_vector_at(0, own), velocity = motion.own_vector_at(0, own);
     FieldAtBall at_ball = {zeros, zeros, {zero, zero, zero, zero, zero, zero}, zero};
     for (int j = chunk[1] + share(); j < chunk[2]; j += SHARES)
         add_source(at_ball, packed, motion, j, x, radius, velocity, mask_of(label != packed.at(7, j)));
@@ -103,11 +103,11 @@ template <class Arrays> CUDA_CALLABLE inline void fields_at(const Arrays& arrays
     const MomentColumns packed(arrays.packed), eddy(arrays.eddy);
     const int* const own = arrays.torque_ball.data + slot;
     const Number zero = Number(Real(0)), radius = packed.own(3, own), label = packed.own(7, own);
-    const Vector x = packed.own_three(0, own);
+    const Vector x = packed.own_vector_at(0, own);
     Vector h = {zero, zero, zero};
     for (int k = chunk[1] + share(); k < chunk[2]; k += SHARES) {
         const int j = arrays.conductor.data[k];
-        add_pair_field(h, x - packed.three(0, j), radius, zero + packed.at(3, j), eddy.three(0, j),
+        add_pair_field(h, x - packed.vector_at(0, j), radius, zero + packed.at(3, j), eddy.vector_at(0, j),
                        mask_of(label != packed.at(7, j)));
     }
     h = group_sums(h);

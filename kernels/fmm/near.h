@@ -150,11 +150,11 @@ template <Quantity Q, class Arrays> void sum_leaf(const Arrays& arrays, int leaf
         if (lowest < 0) continue;
         const int last = begin_of[highest + 1];
         for (int first = begin_of[lowest]; first < last;) {
-            const int room = TILE_SIZE - sources.count, taken = last - first < room ? last - first : room;
+            const int room = TILE_SIZE - sources.count, added = last - first < room ? last - first : room;
             // the middle row contains the targets: their source numbers
             if (k == 4) sources.begin = first - sources.count;
-            append(sources, share.sources, first, first + taken);
-            first += taken;
+            append(sources, share.sources, first, first + added);
+            first += added;
             if (sources.count == TILE_SIZE) sum_tile();
         }
     }

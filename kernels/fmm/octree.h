@@ -41,7 +41,7 @@ CUDA_CALLABLE inline Bits compact_bits(Bits x) {
     return (x | x >> 32) & 0x1fffffull;
 }
 
-// Index of a box: its height above the leaves, its world, and its place in the grid of its level.
+// Index of a box: its height above the leaves, its world, and its position in the grid of its level.
 struct BoxIndex {
     int height, world, x, y, z;
 };

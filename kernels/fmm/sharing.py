@@ -11,7 +11,7 @@ from warpmag.kernels.fmm.octree import Octree
 from warpmag.kernels.fmm.translate import Translation
 
 _LEAST_BOXES = {"cpu": 1, "cuda": 8193}
-"""Fewest boxes worth sharing, by device: below that a GPU splits translations into partial sums of all boxes."""
+"""Fewest boxes that processes share, by device. With fewer, a GPU splits translations into partial sums instead."""
 
 
 def share_boxes(octree: Octree, ranks) -> "BoxShares | None":

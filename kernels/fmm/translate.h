@@ -57,9 +57,9 @@ CUDA_CALLABLE inline int source_box(const Arrays& arrays, int parent, int octant
 #pragma unroll
     for (int axis = 0, stride = 1; axis < 3; ++axis, stride *= 3) {
         const int own = octant >> axis & 1, length = code >> 2 * axis & 3;
-        const int place = own + ((flipped >> axis & 1) == own ? length : -length);
-        near += stride * ((place >> 1) + 1);
-        child |= (place & 1) << axis;
+        const int position = own + ((flipped >> axis & 1) == own ? length : -length);
+        near += stride * ((position >> 1) + 1);
+        child |= (position & 1) << axis;
     }
     const int neighbor = arrays.neighbors.data[27 * (size_t)parent + near];
     if (neighbor < 0) return no_box;

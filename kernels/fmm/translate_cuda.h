@@ -40,8 +40,8 @@ CUDA_CALLABLE inline void find_sources(Stage& stage, const Arrays& arrays, int (
     }
 }
 
-// Starts an asynchronous copy of ``bytes``, a multiple of 16, to shared memory; wait_for_copies waits for this
-// thread's.
+// Starts an asynchronous copy of ``bytes``, a multiple of 16, to shared memory. wait_for_copies waits for the copies of
+// this thread.
 template <int THREADS> CUDA_CALLABLE inline void start_copy(void* to, const void* from, int bytes, int lane) {
     const unsigned there = (unsigned)__cvta_generic_to_shared(to);
     for (int i = 16 * lane; i < bytes; i += 16 * THREADS)

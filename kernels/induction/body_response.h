@@ -34,7 +34,7 @@ struct InducibleBody {
     double* parts;
 };
 
-// A vector of the body's cells. Vectors are in the frame of the body, except ``outside``.
+// A vector of the body's cells, one per lane. Fields and moments are in the body's frame, except ``outside``.
 struct Cell {
     int number;
     Span at;
@@ -93,9 +93,9 @@ CUDA_CALLABLE inline Pair sums_of_body(const InducibleBody& body, Cell* cells, N
     Pair total = {0, 0};
 #if defined(__CUDA_ARCH__)
     if (cells[0].at.count > 0 && share() == 0) numbers_of(cells[0], total.first, total.second);
-    for (int other = 1; other < 32; other *= 2) {
-        total.first += __shfl_xor_sync(~0u, total.first, other);
-        total.second += __shfl_xor_sync(~0u, total.second, other);
+    for (int step = 1; step < 32; step *= 2) {
+        total.first += __shfl_xor_sync(~0u, total.first, step);
+        total.second += __shfl_xor_sync(~0u, total.second, step);
     }
     Pair* const parts = (Pair*)body.parts;
     if (threadIdx.x % 32 == 0) parts[threadIdx.x / 32] = total;

@@ -166,9 +166,9 @@ CUDA_CALLABLE inline Number step_of(const State& state, const Span& at, const Wo
 // any arrangement, and are short only where balls overlap. Cells of one body with a collective response do not overlap.
 template <class State> CUDA_CALLABLE inline Number total_overlap(const State& state, const Span& at) {
     const Real* const labels = entries(state.packed, at, 7) - at.i;
-    const Mask whole = responding(state, at), each = mask_of(Index(0) == Index(0));
+    const Mask responds = responding(state, at), all = mask_of(Index(0) == Index(0));
     auto others = [=](Index i, Index j) {
-        return mask_of(j != i) & (whole ? mask_of(collect(labels, i) != collect(labels, j)) : each);
+        return mask_of(j != i) & (responds ? mask_of(collect(labels, i) != collect(labels, j)) : all);
     };
     return shared_volumes(state, at.i, at.count, at.begin, at.end, others);
 }
@@ -180,7 +180,7 @@ CUDA_CALLABLE inline Vector extrapolated_field(const State& state, const Span& a
     const Real *const past = (const Real*)state.past.data, *const packed = (const Real*)state.packed.data;
     const size_t pitch = state.packed.strides[0] / sizeof(Real);
     const Vector x0 = vector_of(own_four(past, 0, at.row)), x1 = vector_of(own_four(past, 2, at.row));
-    const Mask whole = responding(state, at);
+    const Mask responds = responding(state, at);
     Vector total = {0, 0, 0};
     visit_neighbors(state, at, [&](const int* j, Mask listed) {
         const Four y0 = four_at(past, 0, j), y1 = four_at(past, 2, j);
@@ -189,11 +189,11 @@ CUDA_CALLABLE inline Vector extrapolated_field(const State& state, const Span& a
         add_pair_field(last, x0 - vector_of(y0), ball.w, y0.w, m0, listed);
         add_pair_field(earlier, x1 - vector_of(y1), ball.w, y1.w, m1, listed);
         total += (last + ahead * (last - earlier));
-        if (!any(whole)) return;
+        if (!any(responds)) return;
         const Index n = indices(j) + (at.i - at.row);
         const Vector y = {collect(packed, n), collect(packed + pitch, n), collect(packed + 2 * pitch, n)};
         const Vector m = m0 + ahead * (m0 - m1);
-        add_pair_field(present, vector_of(ball) - y, ball.w, y0.w, m, listed & whole);
+        add_pair_field(present, vector_of(ball) - y, ball.w, y0.w, m, listed & responds);
         total -= present;
     });
     return group_sums(total);
@@ -247,8 +247,8 @@ template <class State> CUDA_CALLABLE inline void sweep(State& state, const Span&
     const Material material = material_of(state, at);
     const Vector s = get(state.s, at);
     const Vector g = get(state.mixed_g, at) + INVERSE_4PI * material.slope / material.saturation * h;
-    const Number step = smaller(Real(SWEEP_STEP) * step_of(state, at, world), Number(Real(1))), none = step * 0;
-    const Vector next = s + (responding(state, at) ? none : step) * (g - s);
+    const Number step = smaller(Real(SWEEP_STEP) * step_of(state, at, world), Number(Real(1))), zero = step * 0;
+    const Vector next = s + (responding(state, at) ? zero : step) * (g - s);
     set(state.s, at, next);
     const Vector m = moments_of(material, ball.w, next);
     if (last) {

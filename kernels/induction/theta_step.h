@@ -89,8 +89,8 @@ CUDA_CALLABLE inline double amplification(const World& world, const double* sums
         removed += world.alpha[a] * sums[PRODUCTS + a]; // ‖φr‖² − ‖φr̄‖²
         gain = slot_gain > gain ? slot_gain : gain;
     }
-    const double all = merit * merit, part = removed > 0.0 ? removed < all ? removed / all : 1.0 : 0.0;
-    const double size = merit > 0.0 ? wp::sqrt(sums[LEFT] * (1.0 - part)) / merit + gain * wp::sqrt(part) : 1.0;
+    const double all = merit * merit, fraction = removed > 0.0 ? removed < all ? removed / all : 1.0 : 0.0;
+    const double size = merit > 0.0 ? wp::sqrt(sums[LEFT] * (1.0 - fraction)) / merit + gain * wp::sqrt(fraction) : 1.0;
     const double slow = world.slowness > 1.0 ? world.slowness * size : size;
     const double least = merit > 0.0 ? LEAST * wp::sqrt(sums[CHANGE]) / merit : 0.0;
     const double error = slow > least ? slow : least;

@@ -57,12 +57,12 @@ CUDA_CALLABLE inline PairForce dipole_force(const Sources& own, const Sources& o
     const Vector t = own.t, m = own.m, t_j = other.t, m_j = other.m;
     const Number g1 = source * inverse, second = g2 * inverse;
     const Number along = dot(u, t), along_j = dot(u, t_j), along_m = dot(u, m), along_m_j = dot(u, m_j);
-    const Number among = dot(second * t, t_j) - dot(second * m, m_j);
-    const Number radial = source * own.q * other.q + own.q * g2 * along_j - other.q * g2 * along - among
+    const Number mutual = dot(second * t, t_j) - dot(second * m, m_j);
+    const Number radial = source * own.q * other.q + own.q * g2 * along_j - other.q * g2 * along - mutual
                           - (third * along) * along_j + (third * along_m) * along_m_j;
-    const Number on = g1 * own.q - second * along, on_j = -(g1 * other.q + second * along_j);
+    const Number factor_j = g1 * own.q - second * along, factor = -(g1 * other.q + second * along_j);
     const Vector across = second * (along_m * m_j + along_m_j * m);
-    return {radial, on * t_j + on_j * t + across};
+    return {radial, factor_j * t_j + factor * t + across};
 }
 
 // Force of quadrupoles on sources, dipoles and each other: derivatives of their energy by distance and direction, with

@@ -16,8 +16,8 @@ CUDA_CALLABLE inline int whole_rounds(int slots) { return parts(slots) * SHARES;
 // Numbers of a ball, STEP rows of CHUNK apart. A GPU reads all of them at once, a CPU reads each where it is used.
 template <int COUNT, int STEP = 1> struct Rows {
     Number at[COUNT];
-    CUDA_CALLABLE explicit Rows(const Real* place) {
-        for (int row = 0; row < COUNT; ++row) at[row] = place[row * STEP * CHUNK];
+    CUDA_CALLABLE explicit Rows(const Real* rows) {
+        for (int row = 0; row < COUNT; ++row) at[row] = rows[row * STEP * CHUNK];
     }
     CUDA_CALLABLE Number operator[](int row) const { return at[row]; }
 };
@@ -57,9 +57,9 @@ CUDA_CALLABLE inline void group_totals(Number (&sum)[16], unsigned used) {
 }
 #else
 template <int COUNT, int STEP = 1> struct Rows {
-    const Real* place;
-    explicit Rows(const Real* place) : place(place) {}
-    Number operator[](int row) const { return numbers(place + row * STEP * CHUNK); }
+    const Real* rows;
+    explicit Rows(const Real* rows) : rows(rows) {}
+    Number operator[](int row) const { return numbers(rows + row * STEP * CHUNK); }
 };
 
 template <int SLOTS> struct Partners {

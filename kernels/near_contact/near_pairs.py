@@ -195,10 +195,10 @@ def allocate(
     n, dtype, device = packed.count, packed.dtype, packed.device
     balls = -(-max(n, 1) // CHUNK) * CHUNK
 
-    def padded(values, other):
-        """Return the values of balls that take part, and ``other`` for all other moments."""
-        chosen = np.pad(np.where(eligible, values, other), (0, balls - n), constant_values=other)
-        return wp.array(chosen, dtype=dtype if isinstance(other, float) else wp.int32, device=device)
+    def padded(values, fill):
+        """Return the values of balls that take part, and ``fill`` for all other moments."""
+        chosen = np.pad(np.where(eligible, values, fill), (0, balls - n), constant_values=fill)
+        return wp.array(chosen, dtype=dtype if isinstance(fill, float) else wp.int32, device=device)
 
     group = padded(worlds, -1)
     radii = packed.radii.numpy()
@@ -258,10 +258,10 @@ def _set_pairs(a, balls: int, dtype, device) -> None:
     def slots(count, rows):
         return zeros(chunks, count, _ROWS[rows], CHUNK)
 
-    itself = np.broadcast_to(np.arange(balls).reshape(chunks, 1, CHUNK), (chunks, NEAR_SLOTS, CHUNK))
-    none = np.full((chunks, CONTACT_SLOTS, CHUNK), chunks * CONTACT_SLOTS * 3 * CHUNK)
-    a.near = wp.array(itself, dtype=wp.int32, device=device)
-    a.counterpart = wp.array(none, dtype=wp.int32, device=device)
+    own_indices = np.broadcast_to(np.arange(balls).reshape(chunks, 1, CHUNK), (chunks, NEAR_SLOTS, CHUNK))
+    no_counterpart = np.full((chunks, CONTACT_SLOTS, CHUNK), chunks * CONTACT_SLOTS * 3 * CHUNK)
+    a.near = wp.array(own_indices, dtype=wp.int32, device=device)
+    a.counterpart = wp.array(no_counterpart, dtype=wp.int32, device=device)
     a.near_count, a.contact_count = zeros(balls, kind=wp.int32), zeros(balls, kind=wp.int32)
     a.used, a.relaxation = zeros(2, balls, kind=wp.int32), zeros(2, balls)
     a.positions, a.sources, a.drives = zeros(balls, LINE), zeros(balls, LINE), zeros(balls, LINE)
@@ -298,7 +298,7 @@ def _launch(buffers: NearContactBuffers, passes: str, first: int, last: int):
 
 
 @contextmanager
-def _beside(buffers: NearContactBuffers):
+def _on_side_stream(buffers: NearContactBuffers):
     """Run the launches of a ``with`` block on a separate stream of a GPU, after all previous launches."""
     if buffers.stream is None:
         yield
@@ -316,7 +316,7 @@ def launch_find_pairs(buffers: NearContactBuffers):
     """
     if buffers.reach == 0.0:
         return
-    with _beside(buffers):
+    with _on_side_stream(buffers):
         _launch(buffers, "Positions", 0, 1)
         neighbors.launch_find_neighbors(buffers.lists, buffers.lists)
         _launch(buffers, "Pairs", 0, 2)
@@ -332,7 +332,7 @@ def launch_sweeps(buffers: NearContactBuffers):
     if buffers.stream is None:
         _launch(buffers, "Sweeps", 0, _LAST_SWEEP_PASS + 1)
         return
-    with _beside(buffers):
+    with _on_side_stream(buffers):
         _launch(buffers, "Sweeps", 1, _LAST_SWEEP_PASS)
         buffers.stream.record_event(buffers.events[1])
         _launch(buffers, "Sweeps", _LAST_SWEEP_PASS, _LAST_SWEEP_PASS + 1)
@@ -341,7 +341,7 @@ def launch_sweeps(buffers: NearContactBuffers):
 def launch_begin_forces(buffers: NearContactBuffers):
     """Begin the sweeps for the forces on a GPU, in parallel with the following launches."""
     if buffers.reach > 0.0 and buffers.stream is not None:
-        with _beside(buffers):
+        with _on_side_stream(buffers):
             _launch(buffers, "Forces", 1, _LAST_SWEEP_PASS + 1)
 
 

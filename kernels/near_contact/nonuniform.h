@@ -21,13 +21,13 @@ struct MomentView {
 
 // View of a moment at r [m] from the center of a ball. b is the radius [m] of the moment's own ball. ``single`` is 1
 // for the only moment of a body, 0 for a cell.
-CUDA_CALLABLE inline MomentView view_moment(Vector r, Number inverse_radius, Number b, Number single, Mask taken) {
+CUDA_CALLABLE inline MomentView view_moment(Vector r, Number inverse_radius, Number b, Number single, Mask is_partner) {
     const Number zero = inverse_radius * Real(0), unit = zero + 1;
     const Vector s = inverse_radius * r;
     const Number d2 = dot(s, s), size = inverse_radius * b, is_single = single > Real(0) ? unit : zero;
     const Number depth = larger(size * (CELL_DEPTH + (1 - CELL_DEPTH) * is_single), zero + LEAST_MAGNET);
     const Number deepest = 1 + (1 - MAGNET_OVERLAP_HIGH) * depth, shallow = 1 + (1 - MAGNET_OVERLAP_LOW) * depth;
-    const Mask live = taken & (d2 < MAGNET_REACH_HIGH * MAGNET_REACH_HIGH) & (d2 > deepest * deepest);
+    const Mask live = is_partner & (d2 < MAGNET_REACH_HIGH * MAGNET_REACH_HIGH) & (d2 > deepest * deepest);
     if (!any(live)) return {{zero, zero, zero}, unit, zero, zero, live};
     const Number inverse = Real(0.5) * twice_inverse_root(live ? d2 : unit), d = d2 * inverse;
     Number weight = live ? unit : zero, slope = zero;
@@ -170,15 +170,15 @@ CUDA_CALLABLE inline void add(Traceless& to, Number k, Traceless t) {
 template <class Get> CUDA_CALLABLE inline MagnetForce multipole_force(const Get& b, const MomentView& s, Vector m) {
     const Vector u = s.u;
     const Number a = dot(u, m), k2 = s.inverse * s.inverse * s.inverse * s.inverse, zero = a * Real(0);
-    const Traceless of[3] = {{b(0), b(1), b(2), b(3), b(4)}, contracted_3(b, 5, u), contracted_4(b, 12, u)};
+    const Traceless contracted[3] = {{b(0), b(1), b(2), b(3), b(4)}, contracted_3(b, 5, u), contracted_4(b, 12, u)};
     Traceless twice = {zero, zero, zero, zero, zero};
     Vector first = {zero, zero, zero}, second = first;
     Number on_m = zero, on_u = zero, k = k2;
     for (int n = 0; n < 3; ++n, k = k * s.inverse) {
         const Real l = Real(n + 2), odd = 2 * l + 1;
-        const Vector v = of[n] * u;
+        const Vector v = contracted[n] * u;
         const Number f = k * odd * dot(v, u);
-        add(twice, k * (l * (l - 1)), of[n]);
+        add(twice, k * (l * (l - 1)), contracted[n]);
         first += k * l * v;
         second += k * (l * odd) * v;
         on_m += f;
@@ -263,8 +263,9 @@ CUDA_CALLABLE inline void find_bounds(const NearArrays& a, int i) {
     bounds[4] = largest;
 }
 
-// Calls visit(j, taken) for partners j of moments i at x with radii ``size``. Partners of balls are permanent moments;
-// partners of ``permanent`` moments are balls. The mask ``taken`` has the lanes of i for which j is a partner.
+// Calls visit(j, is_partner) for partners j of moments i at x with radii ``size``. Partners of balls are permanent
+// moments; partners of ``permanent`` moments are balls. The mask ``is_partner`` has the lanes of i for which j is a
+// partner.
 template <class Visit>
 CUDA_CALLABLE inline void for_each_partner(const NearArrays& a, int i, Vector x, Number size, bool permanent,
                                            Visit visit) {
@@ -301,10 +302,10 @@ CUDA_CALLABLE inline void find_response(const NearArrays& a, int i) {
     const Number inverse_radius = 1 / size;
     Number sums[FULL];
     for (int c = 0; c < FULL; ++c) sums[c] = zero;
-    for_each_partner(a, i, own.at, size, false, [&](int j, Mask taken) {
+    for_each_partner(a, i, own.at, size, false, [&](int j, Mask is_partner) {
         if (a.group[j] >= 0 || a.single[j] < 0) return; // no magnet
         const Magnet o = magnet(a, j);
-        const MomentView s = view_moment(o.at - own.at, inverse_radius, o.size, o.single, taken);
+        const MomentView s = view_moment(o.at - own.at, inverse_radius, o.size, o.single, is_partner);
         if (any(s.live)) add_derivatives(sums, s, scale_moment(o.m, inverse_radius));
     });
     for (int c = 0; c < FULL; ++c) sums[c] = group_sum(sums[c]);
@@ -331,10 +332,10 @@ CUDA_CALLABLE inline void add_ball_forces(const NearArrays& a, int i) {
     const Number inverse_radius = 1 / size;
     const Real* rows = rows_at(a.response, RESPONSE_ROWS, i);
     Vector total = {zero, zero, zero};
-    for_each_partner(a, i, own.at, size, false, [&](int j, Mask taken) {
+    for_each_partner(a, i, own.at, size, false, [&](int j, Mask is_partner) {
         if (a.group[j] >= 0 || a.single[j] < 0) return; // no magnet
         const Magnet o = magnet(a, j);
-        const MomentView s = view_moment(o.at - own.at, inverse_radius, o.size, o.single, taken);
+        const MomentView s = view_moment(o.at - own.at, inverse_radius, o.size, o.single, is_partner);
         if (!any(s.live)) return;
         auto response = [=](int row) -> Number { return numbers(rows + row * CHUNK); };
         total -= magnet_force(response, s, scale_moment(o.m, inverse_radius), o.single).force;
@@ -350,11 +351,11 @@ CUDA_CALLABLE inline void add_magnet_forces(const NearArrays& a, int i) {
     const Magnet own = magnets(a, i);
     const Number zero = own.size * Real(0);
     Vector force = {zero, zero, zero}, torque = force;
-    for_each_partner(a, i, own.at, zero, true, [&](int j, Mask taken) {
+    for_each_partner(a, i, own.at, zero, true, [&](int j, Mask is_partner) {
         if (a.group[j] < 0) return;
         const Magnet ball = magnet(a, j);
         const Number size = ball.size, inverse_radius = 1 / size;
-        const MomentView s = view_moment(own.at - ball.at, inverse_radius, own.size, own.single, taken);
+        const MomentView s = view_moment(own.at - ball.at, inverse_radius, own.size, own.single, is_partner);
         if (!any(s.live)) return;
         const Real* rows = rows_at(a.response, RESPONSE_ROWS, j);
         auto response = [=](int row) -> Number { return broadcast(rows[row * CHUNK]); };

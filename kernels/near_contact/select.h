@@ -35,8 +35,8 @@ CUDA_CALLABLE inline void store_position(const NearArrays& a, int i) {
     put_four(a.positions, 1, i, {zero, number_of(indices(a.kind + i)), zero, zero});
     for (int l = 0; l < WIDTH; ++l) {
         if (a.group[i + l] < 0) continue;
-        const Real* listed = a.found_at + 3 * (size_t)(i + l);
-        const Real x = row[l] - listed[0], y = row[stride + l] - listed[1], z = row[2 * stride + l] - listed[2];
+        const Real* found_at = a.found_at + 3 * (size_t)(i + l);
+        const Real x = row[l] - found_at[0], y = row[stride + l] - found_at[1], z = row[2 * stride + l] - found_at[2];
         const Real limit = MARGIN * row[3 * stride + l];
         if (!(x * x + y * y + z * z <= limit * limit)) raise_flag(*a.moved);
     }
@@ -61,20 +61,21 @@ CUDA_CALLABLE inline void append(const NearArrays& a, int i, const int* j, Index
 
 // Lists the near balls of balls i and writes their counts and weights. Balls with too many near balls have none.
 CUDA_CALLABLE inline void select(const NearArrays& a, int i) {
-    int own[WIDTH], filled[WIDTH], touching[WIDTH], largest = 0;
+    int candidates[WIDTH], filled[WIDTH], touching[WIDTH], largest = 0;
     for (int l = 0; l < WIDTH; ++l) {
-        own[l] = a.group[i + l] < 0 || a.candidate_count[i + l] > CANDIDATES ? 0 : a.candidate_count[i + l];
-        largest = own[l] > largest ? own[l] : largest;
+        candidates[l] = a.group[i + l] < 0 || a.candidate_count[i + l] > CANDIDATES ? 0 : a.candidate_count[i + l];
+        largest = candidates[l] > largest ? candidates[l] : largest;
         filled[l] = 0;
     }
     const Four at = own_four(a.positions, 0, i);
-    const Number counts = number_of(indices(own)), size = at.w, zero = size * Real(0), unit = zero + 1;
+    const Number counts = number_of(indices(candidates)), size = at.w, zero = size * Real(0), unit = zero + 1;
     Number shared = zero;
-    for (int apart = 0; apart < 2; ++apart) {
+    for (int apart = 0; apart < 2; ++apart) { // balls in contact, then other near balls
         for (int first = 0; first < largest; first += SHARES) {
             const int k = first + share();
             int j[WIDTH];
-            for (int l = 0; l < WIDTH; ++l) j[l] = k < own[l] ? a.candidate[(size_t)(i + l) * CANDIDATES + k] : i + l;
+            for (int l = 0; l < WIDTH; ++l)
+                j[l] = k < candidates[l] ? a.candidate[(size_t)(i + l) * CANDIDATES + k] : i + l;
             const Four o = four_at(a.positions, 0, j);
             const Vector r = {o.x - at.x, o.y - at.y, o.z - at.z};
             const Number d2 = dot(r, r), d = root(d2), sum = size + o.w;
@@ -88,12 +89,13 @@ CUDA_CALLABLE inline void select(const NearArrays& a, int i) {
         for (int l = 0; l < WIDTH && !apart; ++l) touching[l] = filled[l];
     }
     const Number excess = (group_total(shared) - MOST_SHARED_LOW) * (1 / (MOST_SHARED_HIGH - MOST_SHARED_LOW));
-    const Number part = 1 - smoothstep(excess).value;
+    const Number weight = 1 - smoothstep(excess).value;
     for (int l = 0; l < WIDTH && share() == 0; ++l) {
-        const bool fits = own[l] > 0 && filled[l] <= NEAR_SLOTS && touching[l] <= CONTACT_SLOTS && lane_of(part, l) > 0;
+        const bool fits =
+            candidates[l] > 0 && filled[l] <= NEAR_SLOTS && touching[l] <= CONTACT_SLOTS && lane_of(weight, l) > 0;
         a.near_count[i + l] = fits ? filled[l] : 0;
         a.contact_count[i + l] = fits ? touching[l] : 0;
-        a.positions[LINE * (size_t)(i + l) + 4] = fits ? lane_of(part, l) : 0;
+        a.positions[LINE * (size_t)(i + l) + 4] = fits ? lane_of(weight, l) : 0;
     }
 }
 

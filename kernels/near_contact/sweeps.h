@@ -159,10 +159,10 @@ CUDA_CALLABLE inline void add_contact_sources(const NearArrays& arrays, Number (
     const Number along = w
                          * (f[2] * a.phi + other_conductance(arrays, f, 3) * b.phi + (f[4] - g) * a.alpha
                             + (f[5] + h) * b.alpha + f[10] * a.gamma + f[11] * b.gamma);
-    const Number on = w * g, on_b = w * h;
-    sum[5] += size * (along * u.x + on * a.field.x + on_b * b.field.x);
-    sum[6] += size * (along * u.y + on * a.field.y + on_b * b.field.y);
-    sum[7] += size * (along * u.z + on * a.field.z + on_b * b.field.z);
+    const Number factor = w * g, factor_b = w * h;
+    sum[5] += size * (along * u.x + factor * a.field.x + factor_b * b.field.x);
+    sum[6] += size * (along * u.y + factor * a.field.y + factor_b * b.field.y);
+    sum[7] += size * (along * u.z + factor * a.field.z + factor_b * b.field.z);
     const Number axial = w
                          * (f[8] * a.phi + other_conductance(arrays, f, 9) * b.phi + f[10] * a.alpha
                             + other_conductance(arrays, f, 11) * b.alpha + f[12] * a.gamma + f[13] * b.gamma);
@@ -198,13 +198,13 @@ CUDA_CALLABLE inline void relax(const NearArrays& a, int i) {
     for (int k = 0; k < parts(14); ++k) {
         const int c = k * SHARES + share();
         const bool contact_quadrupole = c >= 8 && c < 13; // number c − 8 of the sums
-        const Number now = state[k];
+        const Number current = state[k];
         const Number contact = contact_quadrupole ? sum[k % parts(8) * SHARES] : sum[k * SHARES];
         const Number target = c < 5 ? cached[k + parts(8)] : contact;
         const Number pace = PACE * (c == 13 ? of_source : c >= 5 && c < 8 ? of_dipole : unit);
-        const Number next = now + pace * (target - now) + MOMENTUM * (now - last[k]);
+        const Number next = current + pace * (target - current) + MOMENTUM * (current - last[k]);
         moved[k] = next - next == zero ? next : zero;
-        put(last_rows + c * CHUNK, now);
+        put(last_rows + c * CHUNK, current);
         put(rows + c * CHUNK, moved[k]);
     }
     store_line(a.sources, i, moved, SHARES == 1 ? a.own_moment(i) : Vector{zero, zero, zero});

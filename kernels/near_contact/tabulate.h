@@ -1,5 +1,5 @@
-// Tables of the near pairs of one arrangement: directions, radial factors, windows, and conductances from the table of
-// two balls. For each contact also the index of the other ball's part of the force.
+// Tables of the near pairs of one arrangement: directions, radial factors, windows, conductances from the table of two
+// balls, and, for each contact, the index of the other ball's part of the force.
 //
 // From Python: the windows of contact_table.py, and the nodes of its table.
 #pragma once
@@ -32,23 +32,23 @@ CUDA_CALLABLE inline Potential potential(Number d, Number a, Number b, Number ap
 CUDA_CALLABLE inline void tabulate_pair(const NearArrays& arrays, int i, int s, Vector u, const NearPair& p) {
     const Number a = p.a, b = p.b, unit = p.unit, zero = a * Real(0);
     Real *const rows = arrays.pair(s, i), *const slopes = arrays.pair_slope(s, i);
-    auto keep = [=](int row, Number n) { put(rows + row * CHUNK, p.live ? n : zero); };
-    keep(0, u.x);
-    keep(1, u.y);
-    keep(2, u.z);
+    auto write = [=](int row, Number n) { put(rows + row * CHUNK, p.live ? n : zero); };
+    write(0, u.x);
+    write(1, u.y);
+    write(2, u.z);
     // lengths in units of the distance in contact, because powers of meters overflow float32
     const Number y = unit * p.d, third = unit * unit * unit, x = HALF_RANGE * unit;
     const Number apart = larger(a - b, b - a);
     const Potential all = potential(y, unit * a, unit * b, unit * apart), far = potential(y, x * a, x * b, x * apart);
     const Number short_range = y < HALF_RANGE ? p.weight : zero; // fades with the balls' weights
-    keep(3, short_range * unit * (all.u - far.u));
-    keep(4, short_range * unit * unit * (all.g1 - far.g1));
-    keep(5, short_range * third * (all.g2 - far.g2));
-    keep(6, p.inverse);
+    write(3, short_range * unit * (all.u - far.u));
+    write(4, short_range * unit * unit * (all.g1 - far.g1));
+    write(5, short_range * third * (all.g2 - far.g2));
+    write(6, p.inverse);
     put(slopes, p.live ? short_range * third * (unit * (all.g3 - far.g3)) : zero);
     const Fade quadrupole =
         window(2 * y - 2, QUADRUPOLE_GAP_LOW, QUADRUPOLE_GAP_HIGH, QUADRUPOLE_OVERLAP_LOW, QUADRUPOLE_OVERLAP_HIGH);
-    keep(7, p.weight * p.similarity * quadrupole.value);
+    write(7, p.weight * p.similarity * quadrupole.value);
     put(slopes + CHUNK, p.live ? p.weight * p.similarity * 2 * unit * quadrupole.slope : zero);
 }
 
@@ -91,19 +91,19 @@ CUDA_CALLABLE inline void interpolate(const Real* tables, int quarter, const int
 }
 
 // Writes the conductances of slot s of ball i and their derivatives. Adds the ball's self-conductances to two sums.
-CUDA_CALLABLE inline void tabulate_contact(const NearArrays& arrays, int i, int s, const NearPair& p, Number both,
+CUDA_CALLABLE inline void tabulate_contact(const NearArrays& arrays, int i, int s, const NearPair& p, Number weight,
                                            Index kind, Index other_kind, Number& sources, Number& dipoles) {
     const Number zero = p.a * Real(0), scale = 2 * p.a * p.b * p.unit;
-    const auto touches = both > zero;
+    const auto touches = weight > zero;
     const Number gap = touches ? (p.d - p.sum) / scale : zero + 1; // NaN for a point dipole
     Real *const rows = arrays.conductance(s, i), *const slopes = arrays.conductance_slope(s, i);
     const Spline spline(gap);
     const Fade fade = window(gap, CONTACT_GAP_LOW, CONTACT_GAP_HIGH, DEEPEST_LOW, DEEPEST_HIGH);
-    const Number part_value = scale * both * fade.value, part_slope = both * fade.slope,
-                 part_change = both * fade.value;
-    auto keep = [=](int row, Number value) { put(rows + row * CHUNK, touches ? part_value * value : zero); };
+    const Number part_value = scale * weight * fade.value, part_slope = weight * fade.slope,
+                 part_change = weight * fade.value;
+    auto write = [=](int row, Number value) { put(rows + row * CHUNK, touches ? part_value * value : zero); };
     auto store = [=](int row, Number value, Number change) {
-        keep(row, value);
+        write(row, value);
         put(slopes + row * CHUNK, touches ? part_change * change + part_slope * value : zero);
     };
     int lines[WIDTH];
@@ -122,22 +122,22 @@ CUDA_CALLABLE inline void tabulate_contact(const NearArrays& arrays, int i, int 
     if (arrays.kinds == 1) return;
     put_indices(lines, (other_kind * arrays.kinds + kind) * (NODES + 2) + spline.node);
     interpolate(arrays.tables, 0, lines, spline, value, change);
-    keep(14, value.w);
+    write(14, value.w);
     interpolate(arrays.tables, 2, lines, spline, value, change);
-    keep(15, value.y);
-    keep(16, value.w);
+    write(15, value.y);
+    write(16, value.w);
 }
 
 // Finds the index of the other ball's part of a contact's force. If there is none, it is the index of the last entries,
 // which are zero.
 CUDA_CALLABLE inline void find_counterpart(const NearArrays& a, int i, int s, int j) {
-    int place = -1;
+    int found = -1;
     auto takes_part = [&](int ball) { return a.positions[LINE * (size_t)ball + 4] > 0; };
     if (s < a.contact_count[i] && takes_part(i) && takes_part(j))
         for (int slot = 0; slot < a.contact_count[j]; ++slot)
-            place = *list_at(a.near, NEAR_SLOTS, slot, j) == i ? slot : place;
+            found = *list_at(a.near, NEAR_SLOTS, slot, j) == i ? slot : found;
     *list_at(a.counterpart, CONTACT_SLOTS, s, i) =
-        place < 0 ? CONTACT_SLOTS * 3 * a.balls : (int)(a.pair_force(place, j) - a.pair_forces);
+        found < 0 ? CONTACT_SLOTS * 3 * a.balls : (int)(a.pair_force(found, j) - a.pair_forces);
 }
 
 // Sets the state of balls without near balls to zero, so that they start cold when they have one again.
@@ -163,29 +163,30 @@ CUDA_CALLABLE inline void tabulate(const NearArrays& a, int i) {
     const int slots = counted > emptied ? counted : emptied, emptied_contacts = largest_count(used_contacts);
     const Number counts = number_of(indices(a.near_count + i)),
                  contact_counts = number_of(indices(a.contact_count + i));
-    const Four own = own_four(a.positions, 0, i), own_part = own_four(a.positions, 1, i);
+    const Four own = own_four(a.positions, 0, i), own_weight_and_kind = own_four(a.positions, 1, i);
     const Number size = own.w, zero = size * Real(0), unit = zero + 1;
     Number sources = zero, dipoles = zero;
     for (int s = share(); s < slots; s += SHARES) {
         int* const list = list_at(a.near, NEAR_SLOTS, s, i);
         for (int l = 0; l < WIDTH; ++l)
             if (s >= a.near_count[i + l]) list[l] = i + l; // other threads read only the slots in use
-        const Four other = four_at(a.positions, 0, list), part = four_at(a.positions, 1, list);
-        const Number weight = counts > Real(s) ? own_part.x * part.x : zero;
+        const Four other = four_at(a.positions, 0, list), weight_and_kind = four_at(a.positions, 1, list);
+        const Number weight = counts > Real(s) ? own_weight_and_kind.x * weight_and_kind.x : zero;
         const Mask live = weight > zero;
         const Number b = live ? other.w : size + (size > zero ? zero : unit), sum = size + b;
         const Vector r = {other.x - own.x, other.y - own.y, other.z - own.z};
-        const Polar apart = polar(1 / sum * r);
+        const Polar separation = polar(1 / sum * r);
         // bounded below, so that powers of 1/d do not overflow; overlapping balls do not use them
-        const Number d = live ? sum * larger(apart.d, zero + Real(1e-12)) : sum;
+        const Number d = live ? sum * larger(separation.d, zero + Real(1e-12)) : sum;
         const Number ratio = smaller(size, b) / larger(size, b);
         const Number similarity =
             smoothstep((ratio - LEAST_RATIO_LOW) * (1 / (LEAST_RATIO_HIGH - LEAST_RATIO_LOW))).value;
         const NearPair pair = {size, b, sum, 1 / sum, d, 1 / d, weight, similarity, live};
-        tabulate_pair(a, i, s, apart.u, pair);
+        tabulate_pair(a, i, s, separation.u, pair);
         if (s >= contact_slots && s >= emptied_contacts) continue;
-        const Number both = contact_counts > Real(s) ? weight * similarity : zero;
-        tabulate_contact(a, i, s, pair, both, truncated(own_part.y), truncated(part.y), sources, dipoles);
+        const Number contact_weight = contact_counts > Real(s) ? weight * similarity : zero;
+        tabulate_contact(a, i, s, pair, contact_weight, truncated(own_weight_and_kind.y), truncated(weight_and_kind.y),
+                         sources, dipoles);
         for (int l = 0; l < WIDTH; ++l) find_counterpart(a, i + l, s, list[l]);
     }
     sources = group_total(sources);

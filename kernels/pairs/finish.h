@@ -24,10 +24,10 @@ struct Columns {
     size_t pitch;
 
     CUDA_CALLABLE Columns(const wp::array_t<Real>& table) : data(table.data), pitch(table.strides[0] / sizeof(Real)) {}
-    template <class Place> CUDA_CALLABLE Number number(int row, Place i) const {
+    template <class Indices> CUDA_CALLABLE Number number(int row, Indices i) const {
         return collect(data + row * pitch, i);
     }
-    template <class Place> CUDA_CALLABLE Vector vector(int row, Place i) const {
+    template <class Indices> CUDA_CALLABLE Vector vector(int row, Indices i) const {
         return {number(row, i), number(row + 1, i), number(row + 2, i)};
     }
 };
@@ -57,8 +57,8 @@ template <class Arrays> inline TargetRows target_rows(const Arrays& arrays, int 
 }
 inline void put_vectors_at(Real* vectors, const TargetRows& at, Vector v) {
     for (int l = 0; l < at.lane_count; ++l) {
-        Real* const own = vectors + 3 * (size_t)at.i[l];
-        own[0] = v.x[l], own[1] = v.y[l], own[2] = v.z[l];
+        Real* const out = vectors + 3 * (size_t)at.i[l];
+        out[0] = v.x[l], out[1] = v.y[l], out[2] = v.z[l];
     }
 }
 inline Mask nonzero_at(const int* values, const TargetRows& at) {
@@ -68,10 +68,10 @@ inline Mask nonzero_at(const int* values, const TargetRows& at) {
 }
 #endif
 
-// Totals over all partial sums of three of the ROW numbers of each target row, from number ``offset`` on. The threads
-// of a group share the partial sums.
+// Adds up the partial sums of target rows: of the ROW numbers of a sum, the three from ``offset`` on. The threads of a
+// group share the partial sums.
 template <int ROW, class Arrays>
-CUDA_CALLABLE inline Vector added_parts(const Arrays& arrays, const TargetRows& at, int offset) {
+CUDA_CALLABLE inline Vector add_parts(const Arrays& arrays, const TargetRows& at, int offset) {
     Vector total = {0, 0, 0};
 #pragma unroll 4
     for (int part = share(); part < arrays.partial.shape[0]; part += SHARES) {
@@ -79,8 +79,8 @@ CUDA_CALLABLE inline Vector added_parts(const Arrays& arrays, const TargetRows& 
         if constexpr (ROW == 3 && WIDTH > 1) {
             total += vectors(sums + 3 * (size_t)at.first, at.lane_count);
         } else {
-            const Index place = ROW * at.row;
-            total += Vector{collect(sums, place), collect(sums + 1, place), collect(sums + 2, place)};
+            const Index index = ROW * at.row;
+            total += Vector{collect(sums, index), collect(sums + 1, index), collect(sums + 2, index)};
         }
     }
     return total;
@@ -95,13 +95,13 @@ CUDA_CALLABLE inline void add_overlaps(Vector& h, Vector& f, Vector e, const Arr
     const Number radius = targets.number(3, at.i), label = targets.number(7, at.i);
     auto add = [&](auto j, Mask listed) {
         const Vector r = x - sources.vector(0, j);
-        const Number other = sources.number(3, j), contact = radius + other;
+        const Number other_radius = sources.number(3, j), contact = radius + other_radius;
         Mask active = listed & (dot(r, r) < contact * contact);
         if (Q != Quantity::FIELD) active &= label != sources.number(7, j);
         else if (arrays.same_set) active &= mask_of(j != at.i);
         if (WIDTH == 1 && !any(active)) return;
         const Vector m = sources.vector(4, j);
-        auto pair = [&] { return overlap_of(r, radius, other, m, active); };
+        auto pair = [&] { return overlap_of(r, radius, other_radius, m, active); };
         if (Q != Quantity::FIELD) add_where(active, f, force_of(pair(), e));
         if (Q == Quantity::FIELD || Q == Quantity::WRENCH) add_where(active, h, field_of(pair()));
     };
@@ -130,11 +130,11 @@ template <Quantity Q, class Arrays> CUDA_CALLABLE inline void finish_rows(const 
     const Vector base = vectors_at((const Real*)arrays.base.data, at.i);
     Vector h = {0, 0, 0}, f = h, e = h;
     if constexpr (Q == Quantity::FIELD) {
-        h = added_parts<3>(arrays, at, 0);
+        h = add_parts<3>(arrays, at, 0);
     } else {
         e = Columns(arrays.effective).vector(0, at.i);
-        f = added_parts<width(Q)>(arrays, at, 0);
-        if (Q == Quantity::WRENCH) h = added_parts<6>(arrays, at, 3);
+        f = add_parts<width(Q)>(arrays, at, 0);
+        if (Q == Quantity::WRENCH) h = add_parts<6>(arrays, at, 3);
     }
     add_overlaps<Q>(h, f, e, arrays, at);
     store<Q>(arrays, at, group_sums(h), group_sums(f), e, base);

@@ -49,8 +49,8 @@ CUDA_CALLABLE inline void sum_share(int lane, const TileEntry& tile, int source_
     constexpr int VALUES = padded(TARGETS * width(Q), LANES);
     const int column_begin = tile.column_begin, count = tile.row_end - tile.row_begin, own = lane % LANES;
     const bool same = sources.data == target_rows.data;
-    // lanes beyond the last target read other moments, and are not written. Their labels, which mask, and effective
-    // moments, whose table may end, are those of the last target
+    // lanes beyond the last target read other moments, and are not written. They take the last target's label, since
+    // labels mask pairs, and its effective moment, since that table may end there
     const auto target_at = [&](int k) -> Target {
         const Moment t = target_rows.moment(column_begin + own + LANES * k);
         const int column = column_begin + min(own + LANES * k, count - 1);

@@ -21,8 +21,8 @@ template <Quantity Q, int MOMENTS> struct HomeMoments {
     Vec3<Real> scaled[MOMENTS], sums[MOMENTS];
     static constexpr Real SCALE = scaled_moment(Quantity::FIELD);
 
-    // Adds a moment of another tile to the sums h of the home moments, and these to its sums g. inverse(k, d2) is the
-    // inverse distance to the k-th.
+    // Adds a moment of another tile to the sums h of the home moments, and the home moments to its sums g.
+    // inverse(k, d2) is the inverse distance to home moment k.
     template <class Inverse>
     CUDA_CALLABLE void add(Vec3<Real> (&h)[MOMENTS], Vec3<Real>& g, const Source<Real>& source, Inverse inverse) {
 #pragma unroll
@@ -88,9 +88,9 @@ CUDA_CALLABLE inline void sum_mirrored(int block, int thread, const wp::array_t<
     // per warp: the moments of a stage twice, at the end its sums
     __shared__ Quad staging[WARPS][MOMENTS > 8 ? 24 * MOMENTS : 192];
     const int lane = thread % 32, warp = thread / 32;
-    const int* p = tiles.blocks.data + 4 * block;
-    const int home_tile = p[0], share = p[3], walk = p[2] - p[1];
-    const int walk_begin = p[1] + walk * warp / WARPS, walk_end = p[1] + walk * (warp + 1) / WARPS;
+    const int* entry = tiles.blocks.data + 4 * block;
+    const int home_tile = entry[0], share = entry[3], walk = entry[2] - entry[1];
+    const int walk_begin = entry[1] + walk * warp / WARPS, walk_end = entry[1] + walk * (warp + 1) / WARPS;
     const int* edges = tiles.edges.data;
     const int count = tiles.edges.shape[0] - 1, row_begin = edges[home_tile], row_end = edges[home_tile + 1];
     const Table table(packed);
@@ -113,14 +113,14 @@ CUDA_CALLABLE inline void sum_mirrored(int block, int thread, const wp::array_t<
 
     Quad* staged = staging[warp];
 #pragma unroll 1
-    for (int at = walk_begin; at < walk_end; ++at) {
-        const int distance = at / tiles.stages;
+    for (int stage = walk_begin; stage < walk_end; ++stage) {
+        const int distance = stage / tiles.stages;
         const int other = home_tile + distance < count ? home_tile + distance : home_tile + distance - count;
-        const int begin = edges[other] + 32 * (at - distance * tiles.stages), end = edges[other + 1];
+        const int begin = edges[other] + 32 * (stage - distance * tiles.stages), end = edges[other + 1];
         if (begin >= end) continue;
         // lanes beyond the last moment repeat its position, with a zero moment
-        const bool there = begin + lane < end;
-        const Moment s = table.moment(tiles.origin + (there ? begin + lane : end - 1), there);
+        const bool exists = begin + lane < end;
+        const Moment s = table.moment(tiles.origin + (exists ? begin + lane : end - 1), exists);
         const bool fast = __all_sync(ALL_LANES, s.radius == __shfl_sync(ALL_LANES, s.radius, 0) && s.radius > 0
                                                     && distance > 0 && (FIELD || labels.excludes(s.label)));
         __syncwarp();
@@ -130,7 +130,7 @@ CUDA_CALLABLE inline void sum_mirrored(int block, int thread, const wp::array_t<
         __syncwarp();
         const int own = distance == 0 ? row_begin + lane - begin : 32;
         const Vec3<Real> g = add_mirrored_stage<UNROLLED>(home, staged, lane, fast, own);
-        if (there && distance > 0) {
+        if (exists && distance > 0) {
             store(distance - nearest, 3 * (begin + lane), H_FACTOR * g.x);
             store(distance - nearest, 3 * (begin + lane) + 1, H_FACTOR * g.y);
             store(distance - nearest, 3 * (begin + lane) + 2, H_FACTOR * g.z);

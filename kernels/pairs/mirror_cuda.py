@@ -46,7 +46,7 @@ _FIXED_COST = 0.1  # cost of starting and ending a block, and of adding up a spl
 
 @wp.struct
 class MirrorTiles:
-    """Tiles of moments among themselves, on one device."""
+    """Tiles and blocks for the sums of moments among themselves, on one device."""
 
     # Model:
     origin: int  # packed column of the first moment
@@ -98,11 +98,11 @@ def make_mirror(origin: int, count: int, quantity: Quantity, dtype, device, rank
         passes.append((len(passes) * tiles * splits + own[0], own[1] - own[0], nearest))
         split, tile = np.divmod(np.arange(tiles * splits), tiles)
         blocks.append(np.stack((tile, cuts[split], cuts[split + 1], split), axis=1))
-    walk = MirrorTiles()
-    walk.origin, walk.stages, walk.slabs = origin, stages, slabs
-    walk.edges = wp.array(count * np.arange(tiles + 1) // tiles, dtype=wp.int32, device=device)
-    walk.blocks = wp.array(np.concatenate(blocks), dtype=wp.int32, device=device)
-    return Mirror(quantity, shape, walk, tuple(passes), slabs, splits)
+    mirror_tiles = MirrorTiles()
+    mirror_tiles.origin, mirror_tiles.stages, mirror_tiles.slabs = origin, stages, slabs
+    mirror_tiles.edges = wp.array(count * np.arange(tiles + 1) // tiles, dtype=wp.int32, device=device)
+    mirror_tiles.blocks = wp.array(np.concatenate(blocks), dtype=wp.int32, device=device)
+    return Mirror(quantity, shape, mirror_tiles, tuple(passes), slabs, splits)
 
 
 def _choose_splits(shape: MirrorShape, tiles: int, walk: int, multiprocessors: int) -> int:
@@ -132,10 +132,10 @@ def _kernel(dtype, quantity: Quantity, shape: MirrorShape):
     )
 
 
-def launch_pair_loop_mirrored(m: Mirror, packed, partial):
+def launch_pair_loop_mirrored(mirror: Mirror, packed, partial):
     """Sum a quantity over all pairs; see ``evaluate``."""
-    block = 32 * m.shape.warps
-    kernel, device = _kernel(partial.dtype, m.quantity, m.shape), partial.device
-    for first_block, blocks, nearest in m.passes:
-        inputs = [packed, m.tiles, first_block, nearest]
+    block = 32 * mirror.shape.warps
+    kernel, device = _kernel(partial.dtype, mirror.quantity, mirror.shape), partial.device
+    for first_block, blocks, nearest in mirror.passes:
+        inputs = [packed, mirror.tiles, first_block, nearest]
         wp.launch(kernel, block * blocks, inputs=inputs, outputs=[partial], block_dim=block, device=device)

@@ -3,7 +3,7 @@
 
 namespace warpmag {
 
-constexpr double FARTHEST_CELL = 1e9; // farthest index from the origin that safely fits an int
+constexpr double FARTHEST_CELL = 1e9; // largest index that safely fits an int
 
 struct alignas(16) Cell {
     int x, y, z, group; // group −1 stands for no cell
@@ -27,12 +27,13 @@ template <class Lists> CUDA_CALLABLE inline double cells_per_meter_of(const List
 
 // Cell of a moment of a group; no cell if it is too far away or its position is not a number.
 CUDA_CALLABLE inline Cell cell_of(const Balls& balls, int i, int group, double cells_per_meter) {
-    const double place[3] = {balls.x[i] * cells_per_meter, balls.y[i] * cells_per_meter, balls.z[i] * cells_per_meter};
+    const double coordinate[3] = {balls.x[i] * cells_per_meter, balls.y[i] * cells_per_meter,
+                                  balls.z[i] * cells_per_meter};
     int cell[3];
     for (int c = 0; c < 3; ++c) {
-        if (!(place[c] < FARTHEST_CELL && -place[c] < FARTHEST_CELL)) return {0, 0, 0, -1};
-        cell[c] = (int)place[c];
-        cell[c] -= cell[c] > place[c];
+        if (!(coordinate[c] < FARTHEST_CELL && -coordinate[c] < FARTHEST_CELL)) return {0, 0, 0, -1};
+        cell[c] = (int)coordinate[c];
+        cell[c] -= cell[c] > coordinate[c];
     }
     return {cell[0], cell[1], cell[2], group};
 }

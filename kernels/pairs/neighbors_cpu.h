@@ -78,14 +78,14 @@ inline int find_around(const SortedSources& s, const Target& t, Cell cell, int* 
     return count;
 }
 
-// Writes a list in ascending order: the place of an entry is the number of smaller entries.
+// Writes a list in ascending order: the rank of an entry is the number of smaller entries.
 inline void write_sorted(int* list, int count, int* out) {
     const int vectors = (count + WIDTH - 1) / WIDTH;
     put_indices(list + count, Index(__INT_MAX__));
     for (int k = 0; k < count; ++k) {
-        int place = 0;
-        for (int v = 0; v < vectors; ++v) place += __builtin_popcount(bits_of(indices(list + WIDTH * v) < list[k]));
-        out[place] = list[k];
+        int rank = 0;
+        for (int v = 0; v < vectors; ++v) rank += __builtin_popcount(bits_of(indices(list + WIDTH * v) < list[k]));
+        out[rank] = list[k];
     }
 }
 

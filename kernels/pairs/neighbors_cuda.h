@@ -31,8 +31,7 @@ template <class Lists> __device__ inline void fill_table(int j, const Lists& tar
     sources.before.data[j] = last_of(atomicExch(last, (Entry)search << 32 | (unsigned)j), search);
 }
 
-// Lists the neighbors of target ``thread / 32`` in ascending order: the place of an entry is the number of smaller
-// ones.
+// Lists the neighbors of target ``thread / 32`` in ascending order: the rank of an entry is the number of smaller ones.
 template <class Lists> __device__ inline void list_neighbors(int thread, const Lists& targets, const Lists& sources) {
     const int search = targets.searching.data[0], i = thread / 32, c = thread % 32;
     if (search == 0) return;
@@ -58,16 +57,16 @@ template <class Lists> __device__ inline void list_neighbors(int thread, const L
             const Vector r = {x - others.x[j], y - others.y[j], z - others.z[j]};
             const Real reach = ratio * (radius + others.radius[j]);
             if (!(dot(r, r) < reach * reach)) continue;
-            const int place = atomicAdd(&neighbors, 1);
-            if (place < CAPACITY) list[place] = j;
+            const int slot = atomicAdd(&neighbors, 1);
+            if (slot < CAPACITY) list[slot] = j;
         }
     }
     __syncwarp();
     const int count = neighbors < CAPACITY ? neighbors : CAPACITY;
     for (int e = c; e < count; e += 32) {
-        int place = 0;
-        for (int n = 0; n < count; ++n) place += list[n] < list[e];
-        targets.neighbor.data[(size_t)CAPACITY * i + place] = list[e];
+        int rank = 0;
+        for (int n = 0; n < count; ++n) rank += list[n] < list[e];
+        targets.neighbor.data[(size_t)CAPACITY * i + rank] = list[e];
     }
     if (c > 0) return;
     targets.count.data[i] = neighbors;

@@ -16,8 +16,8 @@ template <class N> struct Factors {
 //     U = 1/d + (a+b−d)⁴ (5a² − 20ab + 5b² − 4(a+b)d − d²) / (160 a³b³d),
 //
 // and g1 = −1/A³ where the smaller ball lies inside the larger of radius A. The expression is evaluated in two forms.
-// Near contact and for very different radii the printed form keeps its digits, with 6(a+b)e − 30ab − e² in the brackets
-// and e = a+b−d. For nearly concentric balls the Laurent polynomial in d does.
+// Near contact and for very different radii the form above is accurate, with 6(a+b)e − 30ab − e² in the brackets and
+// e = a+b−d. For nearly concentric balls the Laurent polynomial in d is accurate.
 template <class N> CUDA_CALLABLE inline Factors<N> averaged_factors(N d, N a, N b, N apart) {
     const N p = a * b, s = a + b, i1 = 1 / d, c = 1 / (160 * p * p * p), large = larger(a, b), zero = N(Real(0));
     const auto inside = mask_of(d <= apart), outer_half = mask_of(d > Real(0.5) * s);
@@ -71,9 +71,9 @@ struct Polar {
 CUDA_CALLABLE inline Polar polar(Vector r) {
     const Number zero = Number(Real(0)), one = Number(Real(1));
     const Mask tiny = dot(r, r) < Real(1e-20); // scaled by 2⁶⁰, so that the square does not underflow
-    const Vector lifted = (tiny ? Number(Real(1.152921504606847e18)) : one) * r;
-    const Number d = length(lifted);
-    return {d * (tiny ? Number(Real(8.673617379884035e-19)) : one), (d > zero ? one / d : zero) * lifted};
+    const Vector scaled = (tiny ? Number(Real(1.152921504606847e18)) : one) * r;
+    const Number d = length(scaled);
+    return {d * (tiny ? Number(Real(8.673617379884035e-19)) : one), (d > zero ? one / d : zero) * scaled};
 }
 
 // An overlapping pair in units of its contact distance, so that no power overflows: direction u, distance d, moment m,

@@ -1,4 +1,4 @@
-"""Fields at points apart from sums over pairs: external field, flux density inside balls, gradients as matrices."""
+"""Fields at points, besides sums over pairs: external field, flux density inside balls, gradients as matrices."""
 
 from functools import cache
 
@@ -69,7 +69,9 @@ def _world_field_kernel(vec3):
 
 
 def launch_field_of_worlds(external_field, first, base):
-    """Write the external field [A/m] at points, shape [p]: its value at ``first``, a moment of each point's world."""
+    """Write the external field [A/m] at points, shape [p]: its value at ``first``, the index of a moment in each
+    point's world.
+    """
     inputs = [external_field, first]
     wp.launch(_world_field_kernel(base.dtype), len(base), inputs=inputs, outputs=[base], device=base.device)
 

@@ -52,7 +52,7 @@ def _kernel(dtype, quantity: Quantity):
 
 
 def launch_reference_sums(quantity: Quantity, arrays, smoothing: float):
-    """Sum ``FIELD``, ``FORCE`` or ``WRENCH`` over all pairs of target rows and their sources, to one partial sum.
+    """Sum ``FIELD``, ``FORCE`` or ``WRENCH`` over all pairs of target rows and their sources, in one partial sum.
 
     A field leaves out the target itself if targets and sources are the same. A force leaves out sources with the
     target's label. ``smoothing`` is the length ℓ [m] of the paper's smoothing; 0 for none.

@@ -32,7 +32,7 @@ static_assert(W == 2); // inverse distances are twice_inverse_root(d²)
 template <Quantity Q> constexpr bool MUTUAL = Q == Quantity::FIELD || Q == Quantity::MUTUAL_FORCE;
 template <Quantity Q> constexpr Quantity ONE_SIDED = Q == Quantity::MUTUAL_FORCE ? Quantity::FORCE : Q;
 
-// Numbers of Sums that a quantity uses, and their count.
+// True for the numbers of Sums that a quantity uses; SUMS is their count.
 template <Quantity Q> constexpr bool is_summed(int k) {
     if (MUTUAL<Q>) return k >= 3 && k < 6;
     return Q == Quantity::WRENCH || k < 3 || k == 9;
@@ -75,7 +75,7 @@ struct Table {
     Vec3<Real> vector(int r, int column) const { return {row(r)[column], row(r + 1)[column], row(r + 2)[column]}; }
 };
 
-// Tiles that one thread sums. Shape of ``partial``: [parts, row_count, width(Q)].
+// A share of the tiles, which one thread sums. Shape of ``partial``: [parts, row_count, width(Q)].
 struct Share {
     Table targets, sources, effective;
     const TileEntry *begin, *end;
@@ -157,20 +157,20 @@ template <Quantity Q> inline void fill(Tile& tile, const Table& table, int begin
 }
 
 // Removes a target's own moment from the tile of sources, and restores it at the end of the scope.
-struct Own {
+struct WithoutOwn {
     Tile& sources;
     int i;
     Real kept[TILE_ROWS];
 
-    Own(const Share& share, const Tile& targets, Tile& sources, int target, bool left_out)
+    WithoutOwn(const Share& share, const Tile& targets, Tile& sources, int target, bool remove)
         : sources(sources), i(targets.begin + target - sources.begin) {
-        if (!left_out || share.targets.data != share.sources.data || i < 0 || i >= sources.count) i = -1;
+        if (!remove || share.targets.data != share.sources.data || i < 0 || i >= sources.count) i = -1;
         for (int r = MOMENT; r < TILE_ROWS && i >= 0; ++r) {
             kept[r] = number(sources.rows[r], i);
             number(sources.rows[r], i) = 0;
         }
     }
-    ~Own() {
+    ~WithoutOwn() {
         for (int r = MOMENT; r < TILE_ROWS && i >= 0; ++r) number(sources.rows[r], i) = kept[r];
     }
 };
@@ -233,7 +233,7 @@ __attribute__((noinline)) void sum_pairs(const Share& share, Tile& targets, Tile
         if (K == Kind::ANY && Q != Quantity::FIELD) active &= t.label != sources.rows[LABEL][v];
         return active ? twice_inverse_root(c) : 0;
     };
-    Separation now, next;
+    Separation current, next;
     Simd inv;
     const auto sum_row = [&](int i) __attribute__((always_inline)) -> Sums<Simd> {
         const Target t = target(i), next_target = target(i + 1);
@@ -253,18 +253,18 @@ __attribute__((noinline)) void sum_pairs(const Share& share, Tile& targets, Tile
             ++v;
         }
         if (restarts || i == 0) {
-            now = separation(t, v), next = separation(t, v + 1);
-            inv = inverse(t, now.c, v);
+            current = separation(t, v), next = separation(t, v + 1);
+            inv = inverse(t, current.c, v);
         }
         const auto sum_vector = [&](const Separation& later, Simd next_inv) {
             if constexpr (BOTH) {
                 Vec3<Simd> g = vectors(sources.sums, v);
-                add_mirrored_pair<Q>(sums.h, g, now.r, inv, sources.source(v), e, n);
+                add_mirrored_pair<Q>(sums.h, g, current.r, inv, sources.source(v), e, n);
                 sources.sums[0][v] = g.x, sources.sums[1][v] = g.y, sources.sums[2][v] = g.z;
             } else {
-                add_pair<Q>(sums, now.r, inv, sources.source(v), e);
+                add_pair<Q>(sums, current.r, inv, sources.source(v), e);
             }
-            now = next, next = later, inv = next_inv;
+            current = next, next = later, inv = next_inv;
         };
         for (; v < sources.vectors - 2 * !restarts; ++v) sum_vector(separation(t, v + 2), inverse(t, next.c, v + 1));
         // the next target's first separations
@@ -279,7 +279,7 @@ __attribute__((noinline)) void sum_pairs(const Share& share, Tile& targets, Tile
         const int lane_count = targets.count - i < LANES ? targets.count - i : LANES;
         Simd rows[SUMS<Q>][LANES] = {};
         for (int l = 0; l < lane_count; ++l) {
-            const Own own(share, targets, sources, i + l, !BOTH && Q == Quantity::FIELD);
+            const WithoutOwn own(share, targets, sources, i + l, !BOTH && Q == Quantity::FIELD);
             const Sums<Simd> sums = sum_row(i + l);
             for (int k = 0, used = 0; k < 10; ++k)
                 if (is_summed<Q>(k)) rows[used++][l] = ((const Simd*)&sums)[k];

@@ -128,7 +128,7 @@ struct LabelRange {
 // column own_begin on. A step is plain if its sources all have the given radius and none is masked. Then the clamp is a
 // constant of the target, and a pair takes 20 instructions for the field and 31 for the force. In addition a source
 // takes about four for all targets of a lane, and the staging of 32 sources about sixty. A LONG sum takes the radius
-// from each stage and decides for the whole stage. It adds up partial sums, which keeps it accurate.
+// from each stage, and a whole stage is plain or not. It adds up partial sums, which keeps it accurate.
 template <int LANES, int UNROLLED, bool LONG, Quantity Q, int TARGETS, class TargetAt, class Sources>
 CUDA_CALLABLE inline void add_sources(LaneTargets<Q, TARGETS>& lane_targets, TargetAt target_at, const Sources& sources,
                                       int begin, int end, Real radius, int own_begin, unsigned own_count, int lane,
@@ -158,7 +158,7 @@ CUDA_CALLABLE inline void add_sources(LaneTargets<Q, TARGETS>& lane_targets, Tar
         if constexpr (LONG) radius = __shfl_sync(ALL_LANES, s.radius, 0);
         const bool plain = s.radius == radius && s.radius > 0
                            && (FIELD ? unsigned(j - own_begin) >= own_count : labels.excludes(s.label));
-        const unsigned odd = ~__ballot_sync(ALL_LANES, plain);
+        const unsigned not_plain = ~__ballot_sync(ALL_LANES, plain);
         staged[lane] = {s.x.x, s.x.y, s.x.z, s.m.x};
         staged[lane + 32] = {s.m.y, s.m.z, SCALE * s.m.x, SCALE * s.m.y};
         ((Pair*)(staged + 64))[lane] = {s.radius, FIELD ? 0 : s.label};
@@ -168,7 +168,7 @@ CUDA_CALLABLE inline void add_sources(LaneTargets<Q, TARGETS>& lane_targets, Tar
 #pragma unroll 1
         for (int first = 0; first < count; first += RUN) {
             const int last = LONG ? count : first + RUN;
-            if ((odd >> first & RUN_MASK) == 0) {
+            if ((not_plain >> first & RUN_MASK) == 0) {
 #pragma unroll 1
                 for (int step = first; step < last; step += STRIDE)
 #pragma unroll

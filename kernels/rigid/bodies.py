@@ -235,10 +235,10 @@ def _gather_motion(
     if body < 0:
         return
     velocity = velocity_at(bodies, body, positions_in[i])
-    spin = wp.spatial_bottom(bodies.qd[body])
+    omega = wp.spatial_bottom(bodies.qd[body])
     for c in range(3):
         motion_out[c, i] = velocity[c]
-        motion_out[c + 3, i] = spin[c]
+        motion_out[c + 3, i] = omega[c]
     if (bodies.flags[body] & magnets.kinematic_flag) == 0:
         inverse = bodies.inv_inertia[body]
         motion_out[6, i] = bodies.inv_mass[body]

@@ -123,8 +123,8 @@ def _write_joint(
     local = wp.transform_inverse(parent) * pose * poses.child_frame[joint]
     for k in range(7):
         joint_q[poses.joint_q_start[joint] + k] = local[k]
-    turn = wp.transform_get_rotation(parent)
-    linear, angular = wp.quat_rotate_inv(turn, wp.spatial_top(qd)), wp.quat_rotate_inv(turn, wp.spatial_bottom(qd))
+    q = wp.transform_get_rotation(parent)
+    linear, angular = wp.quat_rotate_inv(q, wp.spatial_top(qd)), wp.quat_rotate_inv(q, wp.spatial_bottom(qd))
     for k in range(3):
         joint_qd[poses.joint_qd_start[joint] + k] = linear[k]
         joint_qd[poses.joint_qd_start[joint] + 3 + k] = angular[k]

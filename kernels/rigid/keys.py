@@ -26,7 +26,7 @@ class KeyedValues:
     times: wp.array[wp.float64]  # times of the keys [s], ascending in each curve, shape [k]
     values: wp.array[wp.float64]  # numbers of all keys, one key after the other
     first: wp.array[wp.int32]  # first key of each curve, and the one after the last, shape [c + 1]
-    place: wp.array[wp.int32]  # index of each curve's first number in ``values``, shape [c]
+    offset: wp.array[wp.int32]  # index of each curve's first number in ``values``, shape [c]
     width: wp.array[wp.int32]  # numbers of a key, shape [c]
     interpolation: wp.array[wp.int32]  # index in ``INTERPOLATIONS``, shape [c]
 
@@ -46,7 +46,7 @@ def keyed_values(curves: Sequence, device) -> Any:
     keyed.times = put(np.concatenate([curve.times for curve in curves]), wp.float64)
     keyed.values = put(np.concatenate([curve.values.ravel() for curve in curves]), wp.float64)
     keyed.first = put(np.concatenate([[0], np.cumsum(counts)]), wp.int32)
-    keyed.place, keyed.width = put(np.cumsum(sizes) - sizes, wp.int32), put(widths, wp.int32)
+    keyed.offset, keyed.width = put(np.cumsum(sizes) - sizes, wp.int32), put(widths, wp.int32)
     keyed.interpolation = put([INTERPOLATIONS.index(curve.interpolation) for curve in curves], wp.int32)
     return keyed
 
@@ -76,7 +76,7 @@ def fraction_after(keyed: KeyedValues, curve: int, key: int, time: wp.float64) -
 @wp.func
 def key_number(keyed: KeyedValues, curve: int, key: int, component: int) -> wp.float64:
     """Return a number of a key."""
-    return keyed.values[keyed.place[curve] + (key - keyed.first[curve]) * keyed.width[curve] + component]
+    return keyed.values[keyed.offset[curve] + (key - keyed.first[curve]) * keyed.width[curve] + component]
 
 
 @wp.func

@@ -12,9 +12,9 @@ no plane closes. Only the tangential relative velocity of closing contacts count
 with a smaller weight: its contacts only have to be detected in time. Motion is computed from velocities, which contacts
 have limited in the last substep.
 
-**Pull of forces.** The displacement by forces within a substep counts, too. Where contacts hold the body, the solver
-has to undo it, and the remainder heats a pile. In Sakura Tree, balls are held under 1,500 times their weight. After 0.6
-s they move at 9 cm/s with substeps of 0.5 ms, and at 2 cm/s with 0.25 ms.
+**Displacement by forces** within a substep counts, too. Where contacts hold the body, the solver has to undo it, and
+the remainder heats a pile. In Sakura Tree, balls are held under 1,500 times their weight. After 0.6 s they move at
+9 cm/s with substeps of 0.5 ms, and at 2 cm/s with 0.25 ms.
 """
 
 import warp as wp

@@ -56,10 +56,10 @@ def _gather_source_motion(
     if body < 0:
         return
     velocity = velocity_at(bodies, body, wp.transform_get_translation(frames_in[s]))
-    spin = wp.spatial_bottom(bodies.qd[body])
+    omega = wp.spatial_bottom(bodies.qd[body])
     for c in range(3):
         motion_out[s, c] = velocity[c]
-        motion_out[s, c + 3] = spin[c]
+        motion_out[s, c + 3] = omega[c]
 
 
 def gather_source_motion(sources: SourceShapes, model, state, frames, motion):
@@ -83,8 +83,8 @@ def _add_reactions(
     center = wp.transform_point(bodies.q[body], bodies.com[body])
     force = wp.vec3()
     torque = wp.vec3()
-    for place in range(sources.run_start[k], sources.run_start[k + 1]):
-        s = sources.order[place]
+    for entry in range(sources.run_start[k], sources.run_start[k + 1]):
+        s = sources.order[entry]
         source_force = wp.vec3(wrenches_in[s, 0], wrenches_in[s, 1], wrenches_in[s, 2])
         source_torque = wp.vec3(wrenches_in[s, 3], wrenches_in[s, 4], wrenches_in[s, 5])
         force += source_force

@@ -13,19 +13,19 @@ CUDA_CALLABLE inline int share() { return threadIdx.x % GROUP; }
 CUDA_CALLABLE inline unsigned group_mask() { return (~0u >> (32 - GROUP)) << (threadIdx.x % 32 / GROUP * GROUP); }
 // Sum over the threads of a group; all threads of the warp take part.
 CUDA_CALLABLE inline Number group_total(Number part) {
-    for (int other = 1; other < GROUP; other *= 2) part += __shfl_xor_sync(~0u, part, other);
+    for (int step = 1; step < GROUP; step *= 2) part += __shfl_xor_sync(~0u, part, step);
     return part;
 }
 // Sum over the threads of a group whose warp may have diverged.
 CUDA_CALLABLE inline Number group_sum(Number part) {
-    for (int other = 1; other < GROUP; other *= 2) part += __shfl_xor_sync(group_mask(), part, other);
+    for (int step = 1; step < GROUP; step *= 2) part += __shfl_xor_sync(group_mask(), part, step);
     return part;
 }
 // Largest count among a warp's balls.
 CUDA_CALLABLE inline int largest_count(const int* counts) {
     int largest = *counts;
-    for (int other = GROUP; other < 32; other *= 2) {
-        const int count = __shfl_xor_sync(~0u, largest, other);
+    for (int step = GROUP; step < 32; step *= 2) {
+        const int count = __shfl_xor_sync(~0u, largest, step);
         largest = count > largest ? count : largest;
     }
     return largest;

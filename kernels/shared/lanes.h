@@ -116,7 +116,7 @@ inline Number gather(const Real* row, const int* j) {
     return n;
 }
 inline Number collect(const Real* row, int j) { return row[j]; }
-template <class Places> inline Number collect(const Real* row, Places j) {
+template <class Indices> inline Number collect(const Real* row, Indices j) {
 #if defined(__AVX512F__)
     if constexpr (WIDTH == 16) return __builtin_ia32_gathersiv16sf(Number(0), row, j, (unsigned short)-1, 4);
     else return __builtin_ia32_gathersiv8df(Number(0), row, j, (unsigned char)-1, 8);
@@ -157,12 +157,12 @@ template <class Half, int... L> inline auto joined(Half a, Half b, Sequence<int,
     return __builtin_shufflevector(a, b, L...);
 }
 
-// Loads four numbers of each ball from the address place(lane), and transposes them into four vectors.
-template <class Place> inline Four fours(Place place) {
+// Loads four numbers of each ball from address(lane), and transposes them into four vectors.
+template <class Address> inline Four load_fours(Address address) {
     typedef __make_integer_seq<Sequence, int, 8> Eight;
     auto part = [=](int l) -> Quarter {
         Quarter q;
-        __builtin_memcpy(&q, place(l), sizeof(q));
+        __builtin_memcpy(&q, address(l), sizeof(q));
         return q;
     };
     auto row = [=](int l) -> Number {
@@ -173,15 +173,15 @@ template <class Place> inline Four fours(Place place) {
     return transposed(row(0), row(1), row(2), row(3));
 }
 inline Four four_at(const Real* lines, int quarter, const int* j) {
-    return fours([=](int l) { return lines + LINE * (size_t)j[l] + 4 * quarter; });
+    return load_fours([=](int l) { return lines + LINE * (size_t)j[l] + 4 * quarter; });
 }
 inline Four own_four(const Real* lines, int quarter, int i) {
-    return fours([=](int l) { return lines + LINE * (size_t)(i + l) + 4 * quarter; });
+    return load_fours([=](int l) { return lines + LINE * (size_t)(i + l) + 4 * quarter; });
 }
-template <int FIRST> inline void put_quarters(Real* place, Number row) {
+template <int FIRST> inline void put_quarters(Real* lines, Number row) {
     const Quarter q = __builtin_shufflevector(row, row, FIRST, FIRST + 1, FIRST + 2, FIRST + 3);
-    __builtin_memcpy(place + FIRST * LINE, &q, sizeof(q));
-    if constexpr (FIRST + 4 < WIDTH) put_quarters<FIRST + 4>(place, row);
+    __builtin_memcpy(lines + FIRST * LINE, &q, sizeof(q));
+    if constexpr (FIRST + 4 < WIDTH) put_quarters<FIRST + 4>(lines, row);
 }
 inline void put_four(Real* lines, int quarter, int i, Four f) {
     const Four rows = transposed(f.x, f.y, f.z, f.w);

@@ -22,8 +22,8 @@ namespace warpmag {
 typedef unsigned long long Word;
 
 constexpr int MOST_THREADS = 64; // as in team.py
-// Polls before a member sleeps, about 1 ms. It yields its core between polls.
-constexpr int PATIENCE = 4000;
+// Takes about 1 ms. A member yields its core between polls.
+constexpr int POLLS_BEFORE_SLEEP = 4000;
 
 enum State : Word { GONE, WAITING, ASLEEP, CLAIMED, POSTED, WORKING }; // GONE and ASLEEP as in team.py
 
@@ -36,8 +36,8 @@ struct Member {
     Word lock[8], wake[8]; // storage of a mutex and of a condition variable
 };
 
-// Changes the state if it is ``from``, and returns true if it was.
-inline bool change(Member* member, Word from, Word to) {
+// Changes a state from ``from`` to ``to``. Returns false, without a change, if the state is another.
+inline bool exchange_state(Member* member, Word from, Word to) {
     return __atomic_compare_exchange_n(&member->state, &from, to, false, __ATOMIC_ACQ_REL, __ATOMIC_RELAXED);
 }
 
@@ -60,15 +60,15 @@ template <class Work> void run_together(Word*, int, Work& work) { work(0); }
 inline void* serve(void* argument) {
     Member* const member = (Member*)argument;
     for (int idle = 0;; ++idle) {
-        if (change(member, POSTED, WORKING)) {
+        if (exchange_state(member, POSTED, WORKING)) {
             member->call(member->job, (int)member->number);
             set_state(member, WAITING);
             idle = 0;
-        } else if (idle < PATIENCE) {
+        } else if (idle < POLLS_BEFORE_SLEEP) {
             sched_yield();
         } else {
             pthread_mutex_lock(member->lock);
-            if (change(member, WAITING, ASLEEP))
+            if (exchange_state(member, WAITING, ASLEEP))
                 while (state_of(member) == ASLEEP) pthread_cond_wait(member->wake, member->lock);
             pthread_mutex_unlock(member->lock);
             idle = 0;
@@ -79,7 +79,7 @@ inline void* serve(void* argument) {
 inline void start_members(int count, Word* team) {
     for (int m = 0; m < count; ++m) {
         Member* const member = (Member*)team + m;
-        if (!change(member, GONE, CLAIMED)) continue;
+        if (!exchange_state(member, GONE, CLAIMED)) continue;
         pthread_mutex_init(member->lock, nullptr);
         pthread_cond_init(member->wake, nullptr);
         set_state(member, WAITING);
@@ -97,8 +97,8 @@ template <class Work> void run_together(Word* team, int threads, Work& work) {
     for (int m = 0; m < MOST_THREADS && count < threads - 1; ++m) {
         Member* const member = (Member*)team + m;
         if (state_of(member) == GONE) break;
-        const bool asleep = change(member, ASLEEP, CLAIMED);
-        if (!asleep && !change(member, WAITING, CLAIMED)) continue;
+        const bool asleep = exchange_state(member, ASLEEP, CLAIMED);
+        if (!asleep && !exchange_state(member, WAITING, CLAIMED)) continue;
         claimed[count++] = member;
         member->call = [](void* job, int number) { (*(Work*)job)(number); };
         member->job = &work;
@@ -112,7 +112,7 @@ template <class Work> void run_together(Word* team, int threads, Work& work) {
     work(0);
     // polling a member's state is faster than sleeping until it ends
     for (int t = 0; t < count; ++t)
-        while (!change(claimed[t], POSTED, WAITING) && state_of(claimed[t]) == WORKING) sched_yield();
+        while (!exchange_state(claimed[t], POSTED, WAITING) && state_of(claimed[t]) == WORKING) sched_yield();
 }
 #endif
 
@@ -141,13 +141,14 @@ void run_passes(Word* team, int threads, int first, int last, Items items, int w
         const int end = begin + taken_at_once < count ? begin + taken_at_once : count;
         for (int i = begin; i < end; i += width) make_pass(pass, i);
     };
-    // the caller takes chunks from the first on, the others from the last on: the data are then often in their caches
-    int taken[MOST_PASSES] = {}, ahead[MOST_PASSES] = {}, behind[MOST_PASSES] = {}, done[MOST_PASSES] = {};
+    // the caller takes chunks from the front, the others from the back, so that their caches often hold the data
+    int taken[MOST_PASSES] = {}, from_front[MOST_PASSES] = {}, from_back[MOST_PASSES] = {}, done[MOST_PASSES] = {};
     auto work = [&](int member) {
         for (int pass = first; pass < last; ++pass) {
             const int chunks = chunks_of(pass);
             while (__atomic_fetch_add(&taken[pass], 1, __ATOMIC_RELAXED) < chunks) {
-                const int n = __atomic_fetch_add(member == 0 ? &ahead[pass] : &behind[pass], 1, __ATOMIC_RELAXED);
+                const int n =
+                    __atomic_fetch_add(member == 0 ? &from_front[pass] : &from_back[pass], 1, __ATOMIC_RELAXED);
                 make_chunk(pass, member == 0 ? n : chunks - 1 - n);
                 __atomic_fetch_add(&done[pass], 1, __ATOMIC_RELEASE);
             }

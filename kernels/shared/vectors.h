@@ -57,9 +57,10 @@ CUDA_CALLABLE inline void put_vector(Real* rows, Vector v) {
 
 // Loads and stores of public buffers, with a number or a vector (x, y, z) for each moment. At the end of a world fewer
 // moments are left than a vector has lanes: only the first ``lane_count`` lanes are read and written, lane by lane.
+// numbers_or sets the other lanes to ``fill``.
 #if defined(__CUDA_ARCH__)
-CUDA_CALLABLE inline Number numbers_or(const Real* row, int lane_count, Real other) {
-    return lane_count > 0 ? *row : other;
+CUDA_CALLABLE inline Number numbers_or(const Real* row, int lane_count, Real fill) {
+    return lane_count > 0 ? *row : fill;
 }
 CUDA_CALLABLE inline void put_first(Real* row, int lane_count, Number n) {
     if (lane_count > 0) *row = n;
@@ -71,8 +72,8 @@ CUDA_CALLABLE inline void put_vectors(Real* rows, int lane_count, Vector v) {
     if (lane_count > 0) rows[0] = v.x, rows[1] = v.y, rows[2] = v.z;
 }
 #else
-inline Number numbers_or(const Real* row, int lane_count, Real other) {
-    Number n = other;
+inline Number numbers_or(const Real* row, int lane_count, Real fill) {
+    Number n = fill;
     if (lane_count >= WIDTH) __builtin_memcpy(&n, row, sizeof(n));
     else
         for (int l = 0; l < lane_count; ++l) n[l] = row[l];
@@ -89,7 +90,7 @@ template <int C, int... L> inline Number component(Number a, Number b, Number c,
     const Number low = __builtin_shufflevector(a, b, (3 * L + C < 2 * WIDTH ? 3 * L + C : 0)...);
     return __builtin_shufflevector(low, c, (3 * L + C < 2 * WIDTH ? L : 3 * L + C - WIDTH)...);
 }
-// Third N (0 to 2) of the interleaved components x, y, z of vectors v.
+// Number N (0 to 2) of the three that hold the components of vectors v in the order x, y, z, x, y, z, ...
 template <int N, int... L> inline Number interleaved(Vector v, Sequence<int, L...>) {
     constexpr int F = N * WIDTH;
     const Number low = __builtin_shufflevector(v.x, v.y,
