@@ -1,7 +1,7 @@
 """Draws results: ``python -m bench.report FILE... [-o bench_out/report]``.
 
 Reads the JSON lines of ``bench.compare`` and ``bench.run``. For each device it draws speed against error at every size,
-and the share of the device's limit against the size, and writes a Markdown table.
+and the share of the device's limit against the size. It also writes a Markdown table.
 
 The limit is the rate of pairs at 20 operations a pair: a separation, its inverse powers and the sums of a field, if
 each pair is evaluated once for each of its ends. A loop that evaluates both ends at once may exceed the limit.

@@ -1,7 +1,7 @@
 """Checks and times warpmag: ``python -m bench.run CASE [--device cuda:0] [--sizes 243 2560]``.
 
 Each size is compared with the float64 oracle at some targets, then timed. Induction and scenes report the error of the
-solve itself, ``writing`` compares runs with and without output, ``swarm`` times the start and the writing of very many
+solve itself. ``writing`` compares runs with and without output. ``swarm`` times the start and the writing of very many
 balls. Each measurement is one JSON line with machine, commit, error and the time of the first call, which compiles.
 """
 

@@ -1,7 +1,7 @@
 """The crystal balls of the paper's Fig. 7: 178 fixed inducible balls around a bar magnet.
 
 The paper states the count and shows the picture, but no sizes or strengths. Here the balls fill a plane grid of 16 × 13
-cells except the middle 10 × 3, where the bar is, as in the bundled scene. The second choice is 14 × 13 cells and a bar
+cells, as in the bundled scene; the bar is in the middle 10 × 3 cells. The second choice is 14 × 13 cells and a bar
 of 4 × 1, with a wider range of fields at the balls. Strengths of the bar:
 
 * weak, 1e6 A/m, neodymium: no ball of iron saturates, ‖H‖ is 0.8 to 20 % of Ms;

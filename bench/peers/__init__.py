@@ -1,9 +1,9 @@
 """Peers of warpmag: the field of n dipoles at each other, as users of other libraries would write it.
 
 A peer is a function of its name in a module of this folder, ``peer(positions, moments, device)``. It takes float32
-NumPy arrays of shape [n, 3] and the name of a Warp device, moves them where the library needs them, and returns an
-:class:`Evaluation`. Peers for point charges take charges of shape [n] in place of moments. ``compare`` reports a peer
-whose library is not installed as failed.
+NumPy arrays of shape [n, 3] and the name of a Warp device. It moves the arrays where the library needs them, and
+returns an :class:`Evaluation`. Peers for point charges take charges of shape [n] in place of moments. ``compare``
+reports a peer whose library is not installed as failed.
 """
 
 import importlib

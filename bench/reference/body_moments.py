@@ -1,9 +1,10 @@
 """Moments of inducible bodies compared with references, at the default spacing and at half of it.
 
 ``python -m bench.reference.body_moments [BODY ...] [--half] [--torque]`` prints m/(V H0) across and along the axis for
-susceptibilities of 1, 10, 1000 and ∞, the difference from Osborn's closed form (ellipsoids) or from a surface integral
-equation (``surface_integrals.py``), and the field evaluations of a cold solve. ``--torque`` prints the torque on a soft
-ellipsoid oblique to a uniform field instead, over μ0 V H0², and the difference from the closed form.
+susceptibilities of 1, 10, 1000 and ∞, and the field evaluations of a cold solve. It also prints the difference from the
+reference: Osborn's closed form for ellipsoids, else a surface integral equation (``surface_integrals.py``).
+``--torque`` prints the torque on a soft ellipsoid oblique to a uniform field instead, over μ0 V H0², and the difference
+from the closed form.
 """
 
 import argparse

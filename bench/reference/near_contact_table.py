@@ -1,8 +1,8 @@
 """Computes the table of the near-contact model: ``python -m bench.reference.near_contact_table``.
 
-For two equal balls of unit radius the exact solution is reduced to sources, dipoles and, on the axis, quadrupoles,
-driven by the potentials and fields of a conducting surface: K = M_LL − M_LH (M_HH + δ)⁻¹ M_HL. M is the matrix of two
-perfect conductors in multipoles, L are these low degrees, H the higher ones, and δ_l = (2l+1)/(l(μr−1)) describes a
+For two equal balls of unit radius the exact solution is reduced to sources, dipoles and, on the axis, quadrupoles. They
+are driven by the potentials and fields of a conducting surface: K = M_LL − M_LH (M_HH + δ)⁻¹ M_HL. M is the matrix of
+two perfect conductors in multipoles. L are these low degrees, H the higher ones, and δ_l = (2l+1)/(l(μr−1)) describes a
 finite permeability. K minus the long-range part M_lr is the short-range resistance of the pair. K₂ is the part of K
 that the model has without the table: no degrees beyond 2, no coupling of sources with quadrupoles. The conductance of
 the pair is ΔC = (K − M_lr)⁻¹ − (K₂ − M_lr)⁻¹.

@@ -296,43 +296,43 @@ def eddy_coefficient(radii, conductivity):
     return 2.0 * math.pi / 15.0 * np.asarray(conductivity, float) * np.asarray(radii, float) ** 5
 
 
-def flux_rates(positions, moments, radii, velocities, spins, derivatives, field=None, *, time=1e-6):
+def flux_rates(positions, moments, radii, velocities, angular_velocities, derivatives, field=None, *, time=1e-6):
     """dB/dt [T/s] inside balls in co-rotating frames, shape [n, 3], by central differences of fields.
 
     Args:
         positions, moments, radii: The moments, fixed in their bodies.
         velocities: Velocities of the moments [m/s], shape [n, 3].
-        spins: Angular velocities of their bodies [rad/s], shape [n, 3].
+        angular_velocities: Angular velocities of their bodies [rad/s], shape [n, 3].
         derivatives: ∂M/∂H of each ball, zero for permanent ones, shape [n, 3, 3].
         field: Function of positions that returns the applied field [A/m]; None means no field.
         time: Half the time between the differences [s].
     """
 
     def h(seconds):
-        moved, rotated = positions + seconds * velocities, moments + seconds * np.cross(spins, moments)
+        moved, rotated = positions + seconds * velocities, moments + seconds * np.cross(angular_velocities, moments)
         return h_field(moved, rotated, radii=radii) + (0.0 if field is None else field(moved))
 
-    rates = (h(time) - h(-time)) / (2.0 * time) - np.cross(spins, h(0.0))
+    rates = (h(time) - h(-time)) / (2.0 * time) - np.cross(angular_velocities, h(0.0))
     return MU0 * (rates + 2.0 / 3.0 * np.einsum("nij,nj->ni", derivatives, rates))
 
 
 def eddy_wrench(coefficients, rates):
-    """Forces [N] and torques [N·m] of eddy currents: minus the gradient of ½ Σ c |dB/dt|² in velocities and spins.
+    """Forces [N] and torques [N·m] of eddy currents: minus the gradient of ½ Σ c |dB/dt|² in both velocities.
 
     Args:
         coefficients: c of each ball, shape [n].
-        rates: :func:`flux_rates` as a function of velocities and spins, both of shape [n, 3]; linear in them.
+        rates: :func:`flux_rates` as a function of velocities and angular velocities, both of shape [n, 3]; linear in them.
 
     Returns:
-        Function of velocities and spins that returns power [W], forces and torques, shape [n, 3].
+        Function of velocities and angular velocities that returns power [W], forces and torques, shape [n, 3].
     """
     n = len(coefficients)
     unit = np.eye(6 * n).reshape(6 * n, 2, n, 3)
     basis = np.stack([rates(v, w) for v, w in unit])
 
-    def wrench(velocities, spins):
-        now = rates(velocities, spins)
-        pull = -np.einsum("n,knc,nc->k", coefficients, basis, now).reshape(2, n, 3)
-        return float(coefficients @ (now**2).sum(axis=1)), pull[0], pull[1]
+    def wrench(velocities, angular_velocities):
+        present = rates(velocities, angular_velocities)
+        wrenches = -np.einsum("n,knc,nc->k", coefficients, basis, present).reshape(2, n, 3)
+        return float(coefficients @ (present**2).sum(axis=1)), wrenches[0], wrenches[1]
 
     return wrench

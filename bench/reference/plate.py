@@ -4,8 +4,8 @@ The plate is at one potential: (1/4π) ∫ σ/‖x − y‖ dA + φ = const, wit
 its two charged faces. σ is constant on rectangles that shrink towards the edges of the plate and of the magnet. The
 force is μ0 ∫ σ H dA, H the field of the magnet.
 
-``python -m bench.reference.plate`` prints force and moment of the plate for some gaps, the change from half as many
-rectangles along each side, and the error of a warpmag model.
+``python -m bench.reference.plate`` prints force and moment of the plate for some gaps, and the error of a warpmag
+model. It also prints the change of the force from half as many rectangles along each side.
 """
 
 import itertools

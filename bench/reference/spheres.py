@@ -5,9 +5,9 @@ other sources,
 
     ψ = Σ_lm a_lm C_lm(r̂)/r^(l+1) + b_lm r^l C_lm(r̂),    a_lm = −p_l b_lm,    p_l = R^(2l+1) l(μr−1)/(l μr + l+1),
 
-C_lm in Racah's normalization. Harmonics about one center are translated to another by the addition theorem,
-b = b0 + T a, which leaves the symmetric positive definite system (1/p + T) a = −b0. Moments are m = 4π a_1, and since
-the free energy is U = −½ μ0 Σ m·H0, forces are F = −∂U/∂x = −2π μ0 aᵀ (∂T/∂x) a, exact for the truncated system too.
+C_lm in Racah's normalization. The addition theorem translates harmonics about one center to another, b = b0 + T a.
+This leaves the symmetric positive definite system (1/p + T) a = −b0. Moments are m = 4π a_1. The free energy is
+U = −½ μ0 Σ m·H0, so forces are F = −∂U/∂x = −2π μ0 aᵀ (∂T/∂x) a. They are exact for the truncated system, too.
 
 Truncating the expansions at order L leaves an error of about exp(−2ξL), cosh ξ = 1 + gap/2R for equal balls: images
 converge to the foci of the bispherical coordinates, exp(−ξ) of a radius off the centers. Near contact L must grow as

@@ -6,8 +6,8 @@ A table belongs to a shape and serves all bodies of that shape. It has a list of
 
 Cells of different bodies act on each other as balls. Where bodies intersect, this would make the operator of induction
 indefinite, with several solutions. So the demagnetizing factor of a cell grows by the fraction of its volume that
-overlaps cells of other bodies, times ``Coupling.hardening``, the largest reduction of a demagnetizing factor by the
-couplings of the body. It is 0.1 for a cube, 0.2 for a ball, more for thin sheets. It sufficed in all 140 arrangements
+overlaps cells of other bodies, times ``Coupling.hardening``. That is the largest reduction of a demagnetizing factor by
+the couplings of the body: 0.1 for a cube, 0.2 for a ball, more for thin sheets. It sufficed in all 140 arrangements
 that were tried, coincident bodies among them. Cubes that only touch overlap by a tenth of a cell, so that the
 demagnetizing factor of these cells grows by 0.01.
 """

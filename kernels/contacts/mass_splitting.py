@@ -2,9 +2,9 @@
 
 The n corner contacts of two boxes face to face all close the same gap, so that they overshoot n times. Iterations with
 momentum β diverge from an overshoot of 2 (1 + β)/(1 + 2β) = 1.38 on (``contact_law.h``). A contact that acts on its
-share of each body's mass closes its share of the gap (Tonge, Benevolenski and Voroshilov 2012, "Mass Splitting for
-Jitter-Free Parallel Rigid Body Simulation"). Its impulses on both bodies remain opposite, so momentum is conserved.
-Division of each body's sum by its number of contacts would not conserve it.
+share of each body's mass closes its share of the gap. Its impulses on both bodies remain opposite, so momentum is
+conserved. Division of each body's sum by its number of contacts would not conserve it. Reference: Tonge, Benevolenski
+and Voroshilov 2012, "Mass Splitting for Jitter-Free Parallel Rigid Body Simulation".
 
 The number of shares bounds the joint effect of all contacts of a body. Let J be the Jacobian rows of the contacts: one
 normal, two tangential, three angular. Each row is divided by the root of its mobility J M⁻¹ Jᵀ, and multiplied by the

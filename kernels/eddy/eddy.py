@@ -25,12 +25,13 @@ eddy moments
 in the field of all moments, and of all moments in the field of e. So the sums over pairs that compute forces use m + e.
 Only the torque on inducible balls needs a separate sum, since the moments alone exert none.
 
-**Left out** are the response of neighbors' magnetizations to the change of the field (they move and rotate with their
-balls), the skin effect, and changes of the applied field other than by motion.
+**Neglected** are the skin effect, changes of the applied field other than by motion, and the response of neighbors'
+magnetizations to the change of the field: they move and rotate with their balls.
 
 **Time steps.** Explicit forces overshoot if they would stop the ball within a step Δt. Therefore c is replaced by
-c / (1 + 2 Δt c K). K bounds the decay rate of the motion due to the braking forces: |N|² times the squared gradients of
-B over the masses of both moments of a pair, plus |N|² times the squares of B over their moments of inertia.
+c / (1 + 2 Δt c K). K bounds the decay rate of the motion due to the braking forces. It is |N|² times a sum over the
+bodies of the ball and of all sources: the squared gradient of B over the mass, plus the square of B over the moment of
+inertia.
 """
 
 import itertools
@@ -61,8 +62,8 @@ def _arrays_type(dtype):
     @wp.struct
     class EddyArrays:
         # Model: conductors, and inducible balls whose torque is computed, in padded chunks of CHUNK balls of one world
-        ball: wp.array[int]  # moment of each place
-        slot: wp.array[int]  # place of each conductor
+        ball: wp.array[int]  # moment of each slot of the chunks
+        slot: wp.array[int]  # slot of each conductor
         chunk: wp.array[wp.vec4i]  # number of balls, range of moments of their world
         torque_ball: wp.array[int]  # the same arrays for inducible balls
         torque_slot: wp.array[int]
@@ -246,24 +247,24 @@ class EddyCurrents:
         setattr(self._arrays, name, wp.array(np.ascontiguousarray(values, np.int32), dtype=kind, device=self._device))
 
     def _lay_out(self, name: str, chunks: str, slots: str, balls, sources) -> np.ndarray:
-        """Store the balls of all worlds in chunks, with their sources and their places; return the balls."""
+        """Store the balls of all worlds in chunks, with their sources and their slots; return the balls."""
         empty = np.zeros(0, int)
-        places, rows, ball_slots = [empty], [], [empty]
+        moments, rows, ball_slots = [empty], [], [empty]
         for own, (begin, end) in zip(balls, sources, strict=True):
             for k in range(0, len(own), CHUNK):
                 part = own[k : k + CHUNK]
                 ball_slots.append(CHUNK * len(rows) + np.arange(len(part)))
-                places.append(np.resize(part, CHUNK))
+                moments.append(np.resize(part, CHUNK))
                 rows.append((len(part), begin, end, 0))
-        self._put(name, np.concatenate(places))
+        self._put(name, np.concatenate(moments))
         self._put(chunks, np.reshape(rows, (-1, 4)), wp.vec4i)
         self._put(slots, np.concatenate(ball_slots))
         return np.concatenate([empty, *balls])
 
-    def _make_pass(self, number: int, places: int):
-        if places:
+    def _make_pass(self, number: int, slots: int):
+        if slots:
             kernel = _passes(self._packed.dtype, _GROUP if self._device.is_cuda else 1)
-            sizes = dict(threads=self._threads, gpu_threads=_GROUP * places)
+            sizes = dict(threads=self._threads, gpu_threads=_GROUP * slots)
             launch_passes(kernel, number, number + 1, self._arrays, device=self._device, **sizes)
 
     def add(self, applied, sources=None, effective=None):

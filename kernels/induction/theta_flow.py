@@ -29,7 +29,7 @@ allows the same error again. So the estimate amplifies the residual (Eq. 12) of 
     error = ‖M − f(H)‖/‖f(H)‖ · max(1, σ [λ ‖φ r̄‖ + γ √(‖φ r‖² − ‖φ r̄‖²)]/‖φ r‖),   λ = ‖φ (2 − ω₁) r‖/‖φ r‖.
 
 With slow convergence many steps like the last one remain. The factor σ is their geometric series ρ/(1 − ρ), and at
-least 1, with ρ the ratio of ‖φ r‖ to its smallest earlier value. Half of a σ carries over to the next evaluation. The
+least 1, with ρ the ratio of ‖φ r‖ to its smallest earlier value. At least half of σ is kept at the next evaluation. The
 error is at least a hundredth of the last ‖φ Δs‖, since sweeps over near contacts lag behind the moments. Rounding is
 not included, and a residual at the level of rounding is not amplified. ``python -m bench.accuracy arrangements``
 compares the estimate with the true error.

@@ -18,8 +18,8 @@ from the exact solution of two balls. Four properties make this work for piles:
   of its surface.
 * **Two ranges.** 1/d is split into U_lr, the potential of balls inflated to ``RANGE``/2 radii, and the rest U_sr, which
   vanishes beyond ``RANGE`` radii. Sources q act by U_sr only, so everything new is local. Both parts are positive.
-* **Quadrupoles do not add.** The quadrupoles that neighbors induce in a ball add up before they act, and cancel in the
-  middle of a pile. So each ball has a quadrupole Θ (symmetric, traceless; its potential is n·Θn/d³), which acts up to
+* **Quadrupoles do not add.** The quadrupoles that neighbors induce in a ball add up before they act. In the middle of a
+  pile they cancel. So each ball has a quadrupole Θ (symmetric, traceless; its potential is n·Θn/d³), which acts up to
   ``QUADRUPOLE_REACH`` radii, and on sources by U_sr. The conductance of a pair is the remainder, and vanishes beyond
   ``CONTACT_GAP``.
 * **An energy.** With a = (0, m, Θ) the actual sources of a ball, split into smooth and contact sources, a = ã + n,
