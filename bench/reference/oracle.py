@@ -321,7 +321,7 @@ def eddy_wrench(coefficients, rates):
 
     Args:
         coefficients: c of each ball, shape [n].
-        rates: :func:`flux_rates` as a function of velocities and angular velocities, both of shape [n, 3]; linear in them.
+        rates: :func:`flux_rates` as a linear function of velocities and angular velocities, shape [n, 3] each.
 
     Returns:
         Function of velocities and angular velocities that returns power [W], forces and torques, shape [n, 3].
