@@ -95,8 +95,8 @@ def add_material(
 ) -> UsdShade.Material:
     """Author a material for physics and rendering, ``/World/Materials/NAME``.
 
-    The color is linear RGB; metalness, roughness and clear coat are 0 to 1. The density [kg/m³] is that of bodies with
-    this material. If ``friction`` is positive, rolling and torsional friction are :data:`CONTACT_PATCH`, else zero.
+    The color is linear RGB; metalness, roughness and clear coat are 0 to 1. Bodies with this material have the density
+    [kg/m³]. If ``friction`` is positive, rolling and torsional friction are :data:`CONTACT_PATCH`, else zero.
     """
     UsdGeom.Scope.Define(stage, "/World/Materials")
     material = UsdShade.Material.Define(stage, f"/World/Materials/{name}")
@@ -286,7 +286,7 @@ def _look_at(eye: Sequence[float], target: Sequence[float]) -> Gf.Matrix4d:
 def run(author: Callable) -> None:
     """Call ``author`` from the command line: ``-o`` is its path, each parameter is an option of the same name.
 
-    Types, defaults and help texts of the options are those of its signature and docstring.
+    Types, defaults and help texts of the options come from its signature and docstring.
     """
     summary = inspect.getdoc(inspect.getmodule(author)).partition("\n")[0]
     texts = dict(re.findall(r"^ {4}(\w+): (.+?)\.?$", inspect.getdoc(author) or "", re.MULTILINE))

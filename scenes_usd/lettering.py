@@ -117,11 +117,11 @@ def boxes(curves: list[np.ndarray]) -> list[Box]:
     """Cover a letter with few overlapping boxes along its strokes, in the order of the area that they add."""
     grids = [_Grid(curves, angle) for angle in _directions(curves)]
     cover: list[Box] = []
-    whole = area(curves)
+    letter_area = area(curves)
     covered = 0.0
-    while covered < _COVERED * whole:
+    while covered < _COVERED * letter_area:
         gain, box = max((grid.best() for grid in grids), key=lambda pair: pair[0])
-        if gain < _LEAST_GAIN * whole:
+        if gain < _LEAST_GAIN * letter_area:
             break
         covered += gain
         cover.append(box)

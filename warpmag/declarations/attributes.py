@@ -34,7 +34,7 @@ class Attribute:
     # A change of a Newton model's array takes effect from the next substep on, or after
     # ``Magnetics.notify_model_changed``, or raises an error.
     model_change: Literal["substep", "notified", "never"] = "never"
-    field: str = ""  # field of the record; attributes of USD alone have a name in the same style
+    field: str = ""  # field of the record, or a name in the same style for an attribute of USD alone
     default: Any = None  # None where the attribute has no default
 
     @property

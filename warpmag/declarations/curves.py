@@ -186,7 +186,7 @@ def _numbers(name: str, quantity: str, values) -> np.ndarray:
 
 
 def _points(name: str, fields, quantity: str, values) -> tuple[np.ndarray, np.ndarray]:
-    """Return the fields at the points of a curve, and as many values of another quantity."""
+    """Return the fields at the points of a curve, and the values of another quantity at these points."""
     h, others = _numbers(name, "fields", fields), _numbers(name, quantity, values)
     if len(h) != len(others):
         raise InputError(f"{name}: {len(h)} fields, but {len(others)} values at them")

@@ -196,7 +196,7 @@ class MagneticSettings:
         check_fields(self, name, "dynamics", "rtol")
 
     def replaced(self, **values) -> "MagneticSettings":
-        """Return the settings with those of ``values`` that are not None, unchecked."""
+        """Return the settings, unchecked, with ``values`` in place of earlier ones; values of None change nothing."""
         return replace(self, **{name: value for name, value in values.items() if value is not None})
 
 

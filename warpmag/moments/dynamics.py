@@ -2,7 +2,7 @@
 
 :func:`make_dynamics` chooses a dynamics by name. All have the same methods, which only launch kernels:
 
-* ``start_from`` sets the magnetizations of the next start,
+* ``start_from`` sets the magnetizations that the next solve starts from,
 * ``start`` starts a solve in the applied field,
 * ``refine`` improves the moments in the field of their neighbors, before the whole field is summed,
 * ``iterate`` checks convergence in the summed field and takes one step.

@@ -147,7 +147,7 @@ def _mirrored(degree: int) -> np.ndarray:
 
 
 def _scales(degree: int) -> np.ndarray:
-    """Return the norm of each real harmonic over that of r^n P_n^m/(n + m)! exp(imφ), shape [K]."""
+    """Return the norm of each real harmonic over the norm of r^n P_n^m/(n + m)! exp(imφ), shape [K]."""
     pairs = zip(degrees(degree).tolist(), np.abs(orders(degree)).tolist(), strict=True)
     return np.array([np.sqrt(float((2 if m else 1) * factorial(n - m) * factorial(n + m))) for n, m in pairs])
 

@@ -121,7 +121,7 @@ def sweep(simulate: Callable[[range], _R], world_count: int, *, together: int) -
 
     Each rank simulates its groups on its own. At the end all ranks receive all results. Worlds of one model may share
     substeps and the form of their sums, so results may depend on the groups. The groups do not depend on the number of
-    ranks: results are bitwise those of a single process, on any device.
+    ranks: results are bitwise identical to a single process, on any device.
 
     Args:
         simulate: Function of the numbers of the worlds of a group. Its result is sent to all ranks and must be
@@ -150,13 +150,13 @@ def sweep(simulate: Callable[[range], _R], world_count: int, *, together: int) -
         return [simulate(worlds) for worlds in groups]
     all_ranks.check_equal({"world_count": world_count, "together": together})
     with errors_on_all_ranks(all_ranks):
-        own = []
+        own_results = []
         with without_ranks():
             for worlds in groups[all_ranks.rank :: all_ranks.size]:
                 if all_ranks.has_failed():
                     break
-                own.append(pickle.dumps(simulate(worlds)))  # here, so that an error of pickling reaches all ranks
-        results = all_ranks.exchange(own)
+                own_results.append(pickle.dumps(simulate(worlds)))  # here, so that its error reaches all ranks
+        results = all_ranks.exchange(own_results)
     return [pickle.loads(results[group % all_ranks.size][group // all_ranks.size]) for group in range(len(groups))]
 
 

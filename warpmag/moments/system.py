@@ -248,7 +248,7 @@ class MomentSystem:
         pairs = pair_count(all_segments)
 
         def evaluations(force, effective):
-            # moments with a torque come last, because the mirrored form of the others writes forces on all moments
+            # moments with a torque come last: the others use the mirrored form, which writes the forces on all moments
             parts = [(force, segments[0]), (Quantity.WRENCH, segments[1])]
             if self._fast.uses_multipoles(Quantity.WRENCH, pairs):  # in one sum, so that actions equal reactions
                 parts = [(Quantity.WRENCH if len(segments[1]) else force, all_segments)]

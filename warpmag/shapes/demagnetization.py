@@ -110,10 +110,10 @@ class Coupling:
         i, j = np.divmod(np.arange(n * n), n)
         law = _pair_law(self.positions[i] - self.positions[j], self.radii[i], self.radii[j], i == j)
         law[i == j] = 0.0  # the magnetization curve contains a ball's own field
-        whole = law.reshape(n, n, 6).copy()
-        whole[np.repeat(np.arange(n), np.diff(self.start)), self.other] += self.tensor
-        whole += self.common[COMPONENTS]
-        return np.stack([whole, law.reshape(n, n, 6)])
+        corrected = law.reshape(n, n, 6).copy()
+        corrected[np.repeat(np.arange(n), np.diff(self.start)), self.other] += self.tensor
+        corrected += self.common[COMPONENTS]
+        return np.stack([corrected, law.reshape(n, n, 6)])
 
 
 def cuboid_tensors(offsets: np.ndarray, sides: np.ndarray) -> np.ndarray:
@@ -320,8 +320,8 @@ def _cut_tensors(sides: np.ndarray, filled: np.ndarray, p, q, separation) -> np.
     table = _tensor_table(reach, sides / split)
     period, size = tuple(2 * split), len(filled)
     filled = np.fft.rfftn(filled, period, axes=(1, 2, 3))
-    twice = np.where(np.arange(split[2] + 1) % split[2] == 0, 1.0, 2.0)  # the other half of the spectrum is conjugate
-    twice = np.broadcast_to(twice, filled.shape[1:]).reshape(-1)
+    weights = np.where(np.arange(split[2] + 1) % split[2] == 0, 1.0, 2.0)  # the other half of the spectrum is conjugate
+    weights = np.broadcast_to(weights, filled.shape[1:]).reshape(-1)
     filled = filled.reshape(size, -1)
     between = (grid(2 * split) + split) % (2 * split) - split  # offset between subcells, in subcells
     valid = np.all(between > -split, axis=1)
@@ -334,9 +334,9 @@ def _cut_tensors(sides: np.ndarray, filled: np.ndarray, p, q, separation) -> np.
         tensors = np.where(valid[:, None], table[tuple(np.minimum(np.abs(steps), reach - 1).T)], 0.0)
         signs = np.where(steps < 0, -1.0, 1.0)
         tensors[:, 3:] *= signs[:, [0, 0, 1]] * signs[:, [1, 2, 2]]
-        tensors = np.fft.rfftn(tensors.reshape(*period, 6), axes=(0, 1, 2)).reshape(-1, 6) * twice[:, None]
+        tensors = np.fft.rfftn(tensors.reshape(*period, 6), axes=(0, 1, 2)).reshape(-1, 6) * weights[:, None]
         rows = order[ends[k] : ends[k + 1]]
-        step = max(1, _BATCH // len(twice))
+        step = max(1, _BATCH // len(weights))
         for start in range(0, len(rows), step):
             part = rows[start : start + step]
             result[part] = ((filled[p[part]] * filled[q[part]].conj()) @ tensors.conj()).real
@@ -344,7 +344,7 @@ def _cut_tensors(sides: np.ndarray, filled: np.ndarray, p, q, separation) -> np.
 
 
 def _binary(filled: np.ndarray) -> np.ndarray:
-    """Return filled shares of the same mean in which each subcell is either empty or equally filled."""
+    """Return filled shares with the same mean in each cell, where subcells are either empty or equally filled."""
     inside = (filled >= np.minimum(0.5, filled.max(axis=(1, 2, 3), keepdims=True))).astype(float)
     return inside * (filled.mean(axis=(1, 2, 3)) / inside.mean(axis=(1, 2, 3)))[:, None, None, None]
 

@@ -8,7 +8,7 @@ each test point counts once.
 
 The accuracy determines :data:`AUTOMATIC_COUNT`. The table lists errors of a uniformly magnetized cube of side L as n³
 point dipoles. The field's error is a relative L2 norm over all points at distance d from the surface. The force acts on
-an iron ball of radius L/8 in contact (5 mm at a cube of 40 mm), with the same error for linear and saturated balls.
+an iron ball of radius L/8 in contact (5 mm at a cube of 40 mm). Its error is equal for linear and saturated balls.
 
 ====  =====  ==============  ============  ==============  ============
 n     n³     field, d=0.2 L  field, d=L/8  force, d=0.2 L  force, d=L/8

@@ -15,7 +15,7 @@ _OUTSIDE, _MARGIN = 0.1, 1.65
 def draw(stage: str, output: str, frame: int, samples: int, width: int, height: int) -> str:
     """Draw a denoised frame of a stage for renderers; return the reason why it cannot be drawn, or an empty string.
 
-    ``frame`` is a time code, ``samples`` are paths per pixel, ``width`` and ``height`` those of the picture [px].
+    ``frame`` is a time code, ``samples`` are paths per pixel; the picture has ``width`` and ``height`` [px].
     """
     import bpy  # noqa: PLC0415  # pyright: ignore[reportMissingImports] - Blender as a module
 

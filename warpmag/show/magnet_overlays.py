@@ -59,8 +59,8 @@ class MagnetOverlays:
             total = np.zeros(record.positions.shape)
             np.add.at(total, (slice(None), bodies), np.where(self._rows[:, None] < 0, 0.0, record.moments))
             volumes = np.bincount(self._owners, weights=self._volumes) * self._unit**3
-            whole = np.bincount(bodies, weights=volumes, minlength=values.shape[1])
-            return np.linalg.norm(total, axis=-1) / np.where(whole > 0.0, whole, np.inf)
+            volumes = np.bincount(bodies, weights=volumes, minlength=values.shape[1])
+            return np.linalg.norm(total, axis=-1) / np.where(volumes > 0.0, volumes, np.inf)
         rows = self._rows[self._owners]
         for frame in range(len(values)):
             positions, moments = self._moments(frame)

@@ -5,8 +5,8 @@ sensor traces the model. It uses the shapes, colors and first camera of the stag
 bodies from the front and above.
 
 Newton's camera returns the light that each surface scatters. A metal scatters none: it mirrors its surroundings, here a
-sky that brightens towards the horizon, a ground and a sun, with Schlick's approximation of Fresnel's reflectance
-(Schlick 1994). Reflections of other bodies are left out.
+sky that brightens towards the horizon, a ground and a sun. Fresnel's reflectance is approximated (Schlick 1994).
+Reflections of other bodies are left out.
 """
 
 # Warp declares vectors, but not that its functions take them
@@ -230,8 +230,8 @@ def _looking_at_bodies(model: newton.Model, field: float) -> wp.transform:
 def _shade(scattered: np.ndarray, normals: np.ndarray, rays: np.ndarray, shapes, albedo, metal, up) -> np.ndarray:
     """Return the linear radiance of each ray, shape [..., 3].
 
-    ``scattered`` is the radiance of the surfaces as if they were matt; ``rays`` are unit directions, shape [..., 3].
-    ``shapes`` are those that rays hit, -1 for none, ``albedo`` and ``metal`` the linear color and metalness by shape.
+    ``scattered`` is the radiance of the surfaces as if they were matte; ``rays`` are unit directions, shape [..., 3].
+    ``shapes`` are indices of the shapes hit, or -1; ``albedo`` and ``metal`` are linear color and metalness by shape.
     """
     radiance = np.where((shapes < 0)[..., None], _surroundings(np.maximum(rays @ up, 0.0)), scattered)
     polished = np.flatnonzero((shapes.ravel() >= 0) & (metal[shapes.ravel()] > 0.0))

@@ -41,7 +41,7 @@ def full_path(path: Path) -> Path:
 def path_between(layer: Path, target: Path) -> str:
     """Return the path by which ``layer`` names ``target``: relative where possible, otherwise absolute."""
     short = os.path.relpath(full_path(target), layer.parent.resolve())
-    for folder in (layer.parent.resolve(), full_path(layer).parent):  # the latter may be a link to the former
+    for folder in (layer.parent.resolve(), full_path(layer).parent):  # the second may be a link to the first
         joined = os.path.normpath(os.path.join(folder, short))
         if not (os.path.exists(joined) and os.path.samefile(joined, target)):
             return str(full_path(target))

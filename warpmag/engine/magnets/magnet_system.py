@@ -32,7 +32,7 @@ def make_system(
     kinematic = [] if flags is None else ((flags.numpy() & KINEMATIC) != 0).tolist()
     # each static magnet counts as a body, numbered after the bodies of the model
     static = np.cumsum([magnet.body < 0 for magnet in magnets]) + model.body_count
-    bodies = [magnet.body if magnet.body >= 0 else own for magnet, own in zip(magnets, static.tolist(), strict=True)]
+    bodies = [magnet.body if magnet.body >= 0 else k for magnet, k in zip(magnets, static.tolist(), strict=True)]
     movable = [magnet.body >= 0 and not kinematic[magnet.body] for magnet in magnets]
     moment_bodies, moments_move = per_moment(bodies, int), per_moment(movable, bool)
     solids = [
@@ -50,7 +50,7 @@ def make_system(
         material=MomentMaterial(
             per_moment([material.saturation for material in materials]),
             per_moment([m.recoil_permeability - 1.0 if m.recoils else m.susceptibility for m in materials]),
-            [own for own, count in zip(curves, counts, strict=True) for _ in range(count)],
+            [magnet_curve for magnet_curve, count in zip(curves, counts, strict=True) for _ in range(count)],
         ),
         external_field=settings.external_field,
         settings=SolverSettings(

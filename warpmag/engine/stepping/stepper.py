@@ -269,8 +269,8 @@ class Stepper:
     def measure_contacts(self, overlap_threshold: float) -> tuple[float, float, int]:
         """Find the contacts of the present state; call :meth:`read_reports` first.
 
-        Return the deepest penetration, over the thickness of the thinner body and in meters, and the number of contacts
-        deeper than ``overlap_threshold`` over the thickness.
+        Return the deepest penetration over the thickness of the thinner body, the deepest penetration [m], and the
+        number of contacts with a ratio of penetration to thickness above ``overlap_threshold``.
         """
         while True:
             self._arrays.peaks.zero_()

@@ -121,7 +121,7 @@ def _add_balls(contents: StageContents, instancer: BallInstancer) -> None:
 
 @quiet()
 def validate(stage: Usd.Stage) -> list[Finding]:
-    """Return the errors and warnings of USD's own validators, without those for usdz packages."""
+    """Return the errors and warnings of USD's own validators, except validators of usdz packages."""
     registry = UsdValidation.ValidationRegistry()
     packages = {validator.name for validator in registry.GetValidatorMetadataForKeyword("UsdzValidators")}
     validators = [validator for validator in registry.GetAllValidatorMetadata() if not validator.isSuite]

@@ -17,7 +17,7 @@ _AS_DRAWN = ("none", "meshSimplification", "sdf", None)
 
 
 def shape_findings(prim: Usd.Prim) -> Iterator[Finding]:
-    """Yield errors in the size of a collider in the world, and in its mesh, whose attributes must be valid."""
+    """Yield errors in a collider's size in the world, and in its mesh. Its attributes must be valid."""
     if prim.IsA(UsdGeom.Mesh):
         yield from _mesh_findings(prim)
     else:

@@ -37,8 +37,8 @@ _LENGTH_ERROR = 0.01
 def expand_instancers(stage: Usd.Stage, time_code: float, *, defer: bool = False) -> list[IdenticalBalls]:
     """Create prims for the instances of physical prims, in a layer of the stage's session.
 
-    Instances take their positions at the time code. Those whose motion a run follows keep all their time samples. With
-    ``defer`` only the first of identical balls gets prims; the rest is returned for :func:`complete_instances`.
+    Instances get their positions at the time code. If a run follows their motion, they keep all time samples. With
+    ``defer`` only the first of identical balls gets prims; the others are returned for :func:`complete_instances`.
 
     Raises:
         InputError: An instancer breaks USD's rules or expands to too many prims.

@@ -1,7 +1,7 @@
 """Checks and prepares joints for Newton's importer.
 
 The importer silently drops joints that it cannot create, and ignores the frame of a fixed prim at a joint. The
-checks report the former; :func:`prepare_joints` returns the frames for the latter.
+checks report dropped joints; :func:`prepare_joints` returns the ignored frames.
 """
 
 import math
@@ -111,8 +111,8 @@ def enabled_joint_paths(stage: Usd.Stage) -> list[str]:
 def prepare_joints(stage: Usd.Stage, *, articulations: bool = True) -> list[GroundedJoint]:
     """Rewrite joints that Newton would misread, in the stage's session layer.
 
-    Joints with a kinematic ``body1`` are attached to the world, joints between two fixed ends are disabled, and the
-    unlimited axes of a generic joint get explicit infinite limits. Solvers in generalized coordinates need
+    Joints with a kinematic ``body1`` are attached to the world. Joints between two fixed ends are disabled. Unlimited
+    axes of a generic joint get explicit infinite limits. Solvers in generalized coordinates need
     ``articulations``. Newton then accepts only trees from parent to child that contain all their bodies. Without
     articulations it accepts any graph of joints.
 

@@ -110,7 +110,7 @@ def freeze(stage: Usd.Stage, time_code: float) -> None:
     """Make the values of ``time_code`` the defaults of the stage, in its session layer.
 
     Newton reads default values only: it would read a pose that has only time samples as the identity. Values inside
-    instances cannot be frozen; :func:`warpmag.usd.survey` reports those that matter. USD ignores time samples of the
+    instances cannot be frozen; :func:`warpmag.usd.survey` reports relevant ones. USD ignores time samples of the
     order of transform operations, so that order stays. Network addresses are blocked. Animated colliders without a
     rigid body become kinematic bodies.
     """

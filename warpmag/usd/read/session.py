@@ -1,8 +1,8 @@
 """Layers that reading adds to the session of a stage: instances as prims, and SI units.
 
-From weak to strong a stage then has its own layers, ``instances`` in its own units, ``units`` in SI units, and the
-session layer itself with the values of one time code. Code that reads the stage can ignore the layers. Code that writes
-a layer over the scene uses :func:`as_written`, the stage as seen below that layer.
+From weak to strong a stage then has its own layers, ``instances`` in its own units, and ``units`` in SI units. The
+session layer itself is the strongest and has the values of one time code. Code that reads the stage can ignore the
+layers. Code that writes a layer over the scene uses :func:`as_written`, the stage as seen below that layer.
 """
 
 from collections.abc import Iterable, Iterator

@@ -20,7 +20,7 @@ _LENGTH = 8
 
 @dataclass(frozen=True)
 class _Kind:
-    """Type of an attribute; ``kind``, ``dtype`` and ``size`` are those of a value, or of an array's element."""
+    """Type of an attribute; ``kind``, ``dtype`` and ``size`` describe a value, or an element of an array."""
 
     name: str
     type_name: str

@@ -236,7 +236,7 @@ class OverLayer:
         return self._vectors[tokens]
 
     def _encode_fields(self, heads: int, first_frame: int) -> bytes:
-        """Return the table of fields: default and samples of each sampled attribute, then the others."""
+        """Return the table of fields: default and samples of each sampled attribute, then other fields."""
         attributes = len(self._sizes)
         names, values = np.empty(2 * attributes, dtype=np.int32), np.empty(2 * attributes, dtype=np.uint64)
         names[::2], names[1::2] = self._token("default"), self._token("timeSamples")
@@ -249,7 +249,7 @@ class OverLayer:
         return struct.pack("<Q", 2 * attributes + len(others)) + names + struct.pack("<Q", len(values)) + values
 
     def _encode_sets(self) -> bytes:
-        """Return the table of sets of fields: those of sampled attributes, then the others."""
+        """Return the table of sets of fields: sets of sampled attributes, then other sets."""
         attributes = len(self._sizes)
         sampled = np.full((attributes, _FIELDS_PER_SAMPLED), _NO_FIELD, dtype=np.uint32)
         sampled[:, 0], sampled[:, 1] = self._type_fields, 2 * np.arange(attributes)

@@ -6,16 +6,15 @@ reference of eight bytes to its value, an attribute has a row of references, and
     values of the layer | heads | frames: the values of all attributes | times | rows | structure of the layer
 
 Space for all planned frames is reserved, as a hole in the file where the file system supports that. A frame is written
-first, and then the count of frames is increased by one write of eight bytes, so readers see complete frames only. For
-more frames than planned, new space, times, rows and structure are appended to the file.
+first. Then one write of eight bytes increases the count of frames, so readers see complete frames only. For more frames
+than planned, new space, times, rows and structure are appended to the file.
 
 An attribute whose value never changes has no samples: its head refers to an empty list of times until the value
 changes.
 
-Format: https://github.com/PixarAnimationStudios/OpenUSD, ``pxr/usd/usd/crateFile.cpp``. Time samples consist of an
-offset to the reference of the times, that reference, and an offset to the number of samples (here the head), followed
-by that number and a reference for each sample (here the row). Offsets count from their own places, and a reference
-includes the type.
+Format: https://github.com/PixarAnimationStudios/OpenUSD, ``pxr/usd/usd/crateFile.cpp``. The head of time samples is an
+offset to the reference of the times, that reference, and an offset to the row. The row is the number of samples and a
+reference for each sample. Offsets count from their own places, and a reference includes the type.
 """
 
 import contextlib
