@@ -51,7 +51,7 @@ def _potential(points, magnet) -> np.ndarray:
 
 
 def _rectangles(half, magnet, count: int):
-    """Rectangles of the plate, narrow towards its edges and those of the magnet: corners and axes of normals."""
+    """Corners and axes of normals of the plate's rectangles, which are narrow near the edges of plate and magnet."""
     edges = []
     for k in range(3):
         inner = magnet[k] + 0.5 * MAGNET * np.array([-1.0, 1.0]) if k < 2 else []

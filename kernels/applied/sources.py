@@ -200,7 +200,7 @@ class FieldSources:
         coils.frame, bodies.frame, coils.strength = self.frames, self.solid_frames, self.strengths
 
     def _lay_out_coils(self, coils):
-        """Copy coils and maps to the device, tables concatenated, and list those of each world."""
+        """Copy coils and maps to the device, with concatenated tables, and list the coils and maps of each world."""
         applied, tables, rows = self.applied, {}, 0
         for source in applied:
             if id(source.table) not in tables:

@@ -98,8 +98,8 @@ def _contact_matrix(
                 row += wp.abs(bodies.inv_inertia[body][i, j])
             largest = wp.max(largest, row)
         for i in range(3):
-            turn = wp.spatial_vector(wp.vec3(), root[i])
-            matrix += relaxation * FRICTION * _scaled_outer(turn, largest)
+            rotation = wp.spatial_vector(wp.vec3(), root[i])
+            matrix += relaxation * FRICTION * _scaled_outer(rotation, largest)
     return matrix
 
 

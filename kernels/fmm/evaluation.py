@@ -91,7 +91,7 @@ class FmmSums:
 
 @cache
 def _sort_kernel(dtype):
-    """Return the kernel that sorts vectors, and sets those of moments that are no sources to zero."""
+    """Return the kernel that sorts vectors, and sets the vectors of moments that are not sources to zero."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def sort_vectors(

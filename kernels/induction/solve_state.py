@@ -37,7 +37,7 @@ class World:
     best: wp.float64  # smallest merit of this solve, negative before the first evaluation
     alpha: wp.types.vector(DEPTH, wp.float64)  # Anderson coefficients
     slowness: wp.float64  # predicted sum of the remaining steps over the last step
-    gain: wp.types.vector(DEPTH, wp.float64)  # size of each stored change of the iterate over that of its residual
+    gain: wp.types.vector(DEPTH, wp.float64)  # ratio ‖φΔs‖/‖φΔr‖ of each stored change
 
 
 @cache

@@ -106,7 +106,7 @@ def _kernel(call: str, header: str, dtype, capacity: int, group: int):
 
 
 def _launch(call: str, targets, sources, dim: int = 1):
-    """Launch ``dim`` threads that make a call of the device's header; on a CPU one thread shares the work out."""
+    """Launch ``dim`` threads that make a call of the device's header; on a CPU one thread shares it with the team."""
     device = targets.packed.device
     header, threads, members = "pairs/neighbors_cuda.h", 0, None
     if device.is_cpu:
@@ -119,8 +119,8 @@ def _launch(call: str, targets, sources, dim: int = 1):
 def launch_find_neighbors(targets, sources):
     """List the sources near each target, if a target has moved too far since the last search.
 
-    The lists of the targets have the reach of both, those of the sources the hash table. If both are the same, a moment
-    is not its own neighbor.
+    ``targets`` holds the reach of both sets, ``sources`` the hash table. If both are the same, a moment is not its own
+    neighbor.
     """
     if targets.packed.device.is_cpu:
         _launch("search_neighbors(targets, sources, threads, team.data)", targets, sources)

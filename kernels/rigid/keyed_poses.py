@@ -146,8 +146,8 @@ def _write_poses(
     pose0, pose1 = _pose(poses, k, poses.time[0] + begin), _pose(poses, k, poses.time[0] + begin + duration)
     com = wp.vec3d(poses.com[body])
     moved = wp.transform_point(pose1, com) - wp.transform_point(pose0, com)
-    turn = wp.transform_get_rotation(pose1) * wp.quat_inverse(wp.transform_get_rotation(pose0))
-    axis, w = wp.vec3d(turn[0], turn[1], turn[2]), turn[3]
+    rotation = wp.transform_get_rotation(pose1) * wp.quat_inverse(wp.transform_get_rotation(pose0))
+    axis, w = wp.vec3d(rotation[0], rotation[1], rotation[2]), rotation[3]
     if w < wp.float64(0.0):
         axis, w = -axis, -w
     sine = wp.length(axis)
@@ -156,8 +156,8 @@ def _write_poses(
         rate = wp.float64(2.0) * wp.atan2(sine, w) / sine
     qd = wp.spatial_vector(wp.vec3(moved / duration), wp.vec3((rate / duration) * axis))
     frame = wp.where(at_end != 0, pose1, pose0)
-    rotation = wp.quaternion(wp.transform_get_rotation(frame), dtype=wp.float32)
-    pose = wp.transform(wp.vec3(wp.transform_get_translation(frame)), rotation)
+    orientation = wp.quaternion(wp.transform_get_rotation(frame), dtype=wp.float32)
+    pose = wp.transform(wp.vec3(wp.transform_get_translation(frame)), orientation)
     body_q_out[body] = pose
     body_qd_out[body] = qd
     if poses.joint[k] >= 0:
