@@ -240,7 +240,7 @@ def test_very_many_balls_are_instances_apart(tmp_path):
 
 
 def test_a_number_of_balls_only_where_there_is_one(tmp_path):
-    with pytest.raises(InputError, match="balls: the scene alphabets has no number"):
+    with pytest.raises(InputError, match="balls: the scene alphabets has a fixed number of balls"):
         make("alphabets", tmp_path, 10)
     with pytest.raises(InputError, match="balls: must be positive"):
         make("million", tmp_path, 0)
