@@ -297,9 +297,9 @@ class _Nccl:
     def merge(self, array) -> None:
         """Launch :meth:`Ranks.merge` on the stream of the device."""
         words = ctypes.c_size_t(array.shape[0] * array.strides[0] // 4)
-        place, stream = ctypes.c_void_p(array.ptr), ctypes.c_void_p(array.device.stream.cuda_stream)
+        pointer, stream = ctypes.c_void_p(array.ptr), ctypes.c_void_p(array.device.stream.cuda_stream)
         with self._scoped_device(array.device):
-            self._check(self._library.ncclAllReduce(place, place, words, _INT32, _SUM, self._communicator, stream))
+            self._check(self._library.ncclAllReduce(pointer, pointer, words, _INT32, _SUM, self._communicator, stream))
 
     def _check(self, result: int) -> None:
         if result:

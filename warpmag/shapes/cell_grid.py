@@ -27,7 +27,7 @@ class Filled:
     shares: np.ndarray  # filled share of each subcell, shape [m, a, b, c]
     weights: np.ndarray  # number of test points of each cell in the filled part, shape [m]
     sums: np.ndarray  # sum of the positions of these points [m], frame of the grid, shape [m, 3]
-    whole: float  # number of test points in the shape, including overlap with earlier shapes
+    point_count: float  # number of test points in the shape, including overlap with earlier shapes
 
 
 @dataclass(frozen=True)
@@ -53,18 +53,18 @@ class CellGrid:
         index = self._cells_near(part)
         cells = self.lower + (index + 0.5) * self.sides
         offsets = ((grid(self.splits) + 0.5) / self.splits - 0.5) * self.sides
-        hits, sums, whole = np.empty((len(cells), len(offsets)), bool), np.empty((len(cells), 3)), 0.0
+        hits, sums, point_count = np.empty((len(cells), len(offsets)), bool), np.empty((len(cells), 3)), 0.0
         step = max(1, _CHUNK // len(offsets))
         for start in range(0, len(cells), step):
             chunk = cells[start : start + step]
             points = (chunk[:, None, :] + offsets).reshape(-1, 3)
             inside, free = _inside(part, others, points)
-            whole += inside
+            point_count += inside
             free = hits[start : start + step] = free.reshape(len(chunk), -1)
             sums[start : start + step] = free.sum(axis=1)[:, None] * chunk + free @ offsets
         used = hits.any(axis=1)
         weights = hits[used].sum(axis=1).astype(float)
-        return Filled(index[used], hits[used].reshape(-1, *self.splits).astype(float), weights, sums[used], whole)
+        return Filled(index[used], hits[used].reshape(-1, *self.splits).astype(float), weights, sums[used], point_count)
 
     def _cells_near(self, part: Solid) -> np.ndarray:
         """Return the sorted indices of the cells that the rotated bounding box of a shape reaches into."""
@@ -81,7 +81,7 @@ class CellGrid:
     def _filled_by_thin_shape(self, part: Solid, others: list[Solid], pitch: np.ndarray) -> Filled:
         """Return :meth:`filled` of a thin shape from its own test points, because the grid's points may miss it."""
         points = part.test_points(np.maximum(np.ceil((part.upper - part.lower) / pitch).astype(int), _MOST_SPLITS))
-        whole, free = _inside(part, others, points)
+        point_count, free = _inside(part, others, points)
         points = points[free]
         coordinates = (points - self.lower) / self.sides
         index = np.clip(coordinates.astype(int), 0, self.counts - 1)
@@ -92,9 +92,9 @@ class CellGrid:
         size = int(self.splits.prod())
         hits = np.bincount(cell * size + subcell, minlength=len(index) * size).reshape(-1, *self.splits)
         sums = np.stack([np.bincount(cell, x, len(index)) for x in points.T], axis=1)
-        share = part.volume / max(whole, 1) / (self.sides / self.splits).prod()
+        share = part.volume / max(point_count, 1) / (self.sides / self.splits).prod()
         weights = hits.sum(axis=(1, 2, 3)).astype(float)
-        return Filled(index, hits * share, weights, sums, whole)
+        return Filled(index, hits * share, weights, sums, point_count)
 
 
 def cells_over(parts: Sequence[Solid], earlier: Sequence[Solid], spacing: float, across: int) -> CellGrid:

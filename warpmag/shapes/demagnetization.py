@@ -296,11 +296,11 @@ def _piece_tensors(part: Pieces, p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return ∫∫ of the demagnetizing kernel over pairs of pieces, divided by a cell's volume, shape [pairs, 6]."""
     separation = part.index[p] - part.index[q]
     full = part.filled.min(axis=(1, 2, 3)) == 1.0
-    whole, touching = full[p] & full[q], (np.abs(separation) <= 1).all(axis=1)
-    near, far = np.flatnonzero(~whole & touching), np.flatnonzero(~whole & ~touching)
+    both_full, touching = full[p] & full[q], (np.abs(separation) <= 1).all(axis=1)
+    near, far = np.flatnonzero(~both_full & touching), np.flatnonzero(~both_full & ~touching)
     result = np.empty((len(p), 6))
-    offsets, inverse = np.unique(separation[whole], axis=0, return_inverse=True)
-    result[whole] = cuboid_tensors(offsets, part.sides)[inverse.reshape(-1)]
+    offsets, inverse = np.unique(separation[both_full], axis=0, return_inverse=True)
+    result[both_full] = cuboid_tensors(offsets, part.sides)[inverse.reshape(-1)]
     if len(near):
         filled = _binary(_coarsened(part.filled, _SUBCELLS))
         result[near] = _cut_tensors(part.sides, filled, p[near], q[near], separation[near])

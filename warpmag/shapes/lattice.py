@@ -255,13 +255,13 @@ def _concatenated(pieces: list[Pieces]) -> Pieces:
 def _fill_part(cells: CellGrid, k: int) -> tuple[np.ndarray, np.ndarray, Pieces]:
     """Return positions [m], body frame, volumes [m³] and pieces of shape ``k``'s moments outside earlier shapes."""
     part, filled = cells.solids[k], cells.filled(k)
-    if filled.whole == 0.0:
+    if filled.point_count == 0.0:
         raise InputError(f"{part.name}: too thin to be filled with moments")
     positions, weights, (piece, moment, share) = _joined(filled) if len(filled.index) else _NO_MOMENTS
-    if filled.weights.sum() == filled.whole:  # no overlap: the exact centroid is known
+    if filled.weights.sum() == filled.point_count:  # no overlap: the exact centroid is known
         positions = positions + part.to_body(part.centroid[None]) - weights @ positions / weights.sum()
     pieces = Pieces(cells.sides, filled.index, filled.shares, piece, moment, share, cells.position, cells.rotation)
-    return positions @ cells.rotation.T + cells.position, weights * (part.volume / filled.whole), pieces
+    return positions @ cells.rotation.T + cells.position, weights * (part.volume / filled.point_count), pieces
 
 
 def _joined(filled: Filled) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:

@@ -26,14 +26,14 @@ class Solid:
 
     def posed(self, position: Values, quaternion: Values = (0.0, 0.0, 0.0, 1.0)) -> "Solid":
         """Return the shape at ``position`` [m], rotated by ``quaternion`` (x, y, z, w), both in the body's frame."""
-        place, q = np.asarray(position, float), np.asarray(quaternion, float)
-        if place.shape != (3,) or not np.isfinite(place).all():
+        origin, q = np.asarray(position, float), np.asarray(quaternion, float)
+        if origin.shape != (3,) or not np.isfinite(origin).all():
             raise InputError(f"{self.name}: position must be three finite lengths, got {position}")
         if q.shape != (4,) or not (np.isfinite(q).all() and q.any()):
             raise InputError(f"{self.name}: quaternion must be four finite numbers, not all zero, got {quaternion}")
         x, y, z, w = q / np.linalg.norm(q)
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        return replace(self, position=place, rotation=np.eye(3) + 2.0 * (w * cross + cross @ cross))
+        return replace(self, position=origin, rotation=np.eye(3) + 2.0 * (w * cross + cross @ cross))
 
     def to_body(self, points: np.ndarray) -> np.ndarray:
         """Transform points [m], shape [n, 3], from the frame of the shape to the body's."""

@@ -161,8 +161,8 @@ def _near_potentials(points: np.ndarray, surface: np.ndarray, near: np.ndarray) 
         side, length = surface[:, (k + 1) % 4] - surface[:, k], lengths[:, k]
         outward = np.cross(side, normals) / np.maximum(length, np.finfo(float).tiny)[:, None]
         across = (np.einsum("mk,mk->m", outward, surface[:, k]) - points @ outward.T)[near]
-        both, length = distances[k] + distances[(k + 1) % 4], length[facet]
-        total += across * np.log((both + length) / np.maximum(both - length, _ON_EDGE * both))
+        r1_plus_r2, length = distances[k] + distances[(k + 1) % 4], length[facet]
+        total += across * np.log((r1_plus_r2 + length) / np.maximum(r1_plus_r2 - length, _ON_EDGE * r1_plus_r2))
     angle = np.ones(len(height), complex)
     for k in (1, 2):
         corners = surface[:, 0], surface[:, k], surface[:, k + 1]

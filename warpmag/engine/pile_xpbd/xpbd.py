@@ -124,19 +124,19 @@ class PileXPBD(newton.solvers.SolverXPBD):
     @contextlib.contextmanager
     def _splitting(self) -> Iterator[None]:
         """Replace the masses in Newton's contacts by the split masses within the context."""
-        self._whole_masses = self.body_inv_mass_effective, self.body_inv_inertia_effective
+        self._unsplit_masses = self.body_inv_mass_effective, self.body_inv_inertia_effective
         self.body_inv_mass_effective, self.body_inv_inertia_effective = self._contact_masses()
         try:
             yield
         finally:
-            self.body_inv_mass_effective, self.body_inv_inertia_effective = self._whole_masses
+            self.body_inv_mass_effective, self.body_inv_inertia_effective = self._unsplit_masses
 
     def _contact_masses(self) -> tuple[wp.array, wp.array]:
         """Return the inverse masses and inertias for contacts, split where bodies are split."""
-        whole = self.body_inv_mass_effective, self.body_inv_inertia_effective
+        unsplit = self.body_inv_mass_effective, self.body_inv_inertia_effective
         if self._split_bodies is None:
-            return whole
-        launch_split_masses(self._shares, whole, self._split_masses)
+            return unsplit
+        launch_split_masses(self._shares, unsplit, self._split_masses)
         return self._split_masses
 
     def _apply_body_deltas(self, model, state_in, state_out, body_deltas, dt, rigid_contact_inv_weight=None):
@@ -145,7 +145,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
         source, target = (state_in, state_out) if self._body_delta_counter else (state_out, state_in)
         self._body_delta_counter = 1 - self._body_delta_counter
         bodies = view_bodies(model, source)
-        bodies.inv_mass, bodies.inv_inertia = self._whole_masses
+        bodies.inv_mass, bodies.inv_inertia = self._unsplit_masses
         launch_apply_corrections(bodies, body_deltas, rigid_contact_inv_weight, dt, target.body_q, target.body_qd)
         return target.body_q, target.body_qd
 
