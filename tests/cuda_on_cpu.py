@@ -21,8 +21,8 @@ TESTS = Path(__file__).resolve().parent
 KERNELS = TESTS.parent / "kernels"
 INSTRUCTIONS = {
     r'asm\("rsqrt\.approx\.ftz\.f32.*': "y = cuda_on_cpu::rsqrt_ftz(c);",
-    r"const unsigned there = \(unsigned\)__cvta_generic_to_shared\(to\);": "char* const there = (char*)to;",
-    r'asm volatile\("cp\.async\.cg.*': "cuda_on_cpu::begin_copy(there + i, (const char*)from + i);",
+    r"const unsigned address = \(unsigned\)__cvta_generic_to_shared\(to\);": "char* const address = (char*)to;",
+    r'asm volatile\("cp\.async\.cg.*': "cuda_on_cpu::begin_copy(address + i, (const char*)from + i);",
     r'asm volatile\("cp\.async\.wait_all;".*?\);': "cuda_on_cpu::end_copies();",
     r'asm\("mapa\.u64.*': "there = here;",
     r'asm volatile\("mov\.u64 %0, %globaltimer.*': "t = __builtin_readcyclecounter();",

@@ -13,7 +13,7 @@ FAULTS = {
     "misaligned": ("address", "*(float*)((char*)a.data + a.shape[0] + 1) = 1.0f;", "misaligned address"),
     "race": (
         "thread",
-        "warpmag::share_out(team.data, 2, 1 << 20, 1, [&](int) { a.data[0] += 1.0f; });",
+        "warpmag::share_items(team.data, 2, 1 << 20, 1, [&](int) { a.data[0] += 1.0f; });",
         "data race",
     ),
 }

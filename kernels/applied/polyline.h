@@ -12,16 +12,16 @@ namespace warpmag {
 
 // Field of a thin piece from a to b, of 4π amperes.
 CUDA_CALLABLE inline PointField thin_piece(Point a, Point b, Point x) {
-    const Point l = b - a, r = x - a, s = x - b, turn = cross(l, r);
+    const Point l = b - a, r = x - a, s = x - b, normal = cross(l, r);
     const double rs = dot(r, s), nr = norm(r), ns = norm(s), product = nr * ns;
-    const double opening = rs < 0 ? dot(turn, turn) / (product - rs) : product + rs;
+    const double opening = rs < 0 ? dot(normal, normal) / (product - rs) : product + rs;
     const double numerator = nr + ns, denominator = product * opening;
     const Point d_numerator = (1 / nr) * r + (1 / ns) * s, d_product = (ns / nr) * r + (nr / ns) * s;
     const Point d_denominator = opening * d_product + product * (d_product + r + s);
     const double f = numerator / denominator;
     const Point df = (1 / denominator) * (d_numerator - f * d_denominator);
-    return {f * turn, df.x * turn + f * cross(l, {1, 0, 0}), df.y * turn + f * cross(l, {0, 1, 0}),
-            df.z * turn + f * cross(l, {0, 0, 1})};
+    return {f * normal, df.x * normal + f * cross(l, {1, 0, 0}), df.y * normal + f * cross(l, {0, 1, 0}),
+            df.z * normal + f * cross(l, {0, 0, 1})};
 }
 
 // Field of a piece of wire of radius w, of 4π amperes.

@@ -77,9 +77,9 @@ CUDA_CALLABLE inline Wrench zero_wrench() {
 // Adds the wrench of a field on moments m at x: f = ∇(m·H), torque (x − center) × f + m × H, energy −m·H.
 CUDA_CALLABLE inline void add_wrench(Wrench& wrench, Mask mask, const TargetField& field, Vector m, Vector x,
                                      Real3 center) {
-    const Vector f = gradient_dot(field, m), turn = cross(x - broadcast(center), f) + cross(m, field.h);
+    const Vector f = gradient_dot(field, m), torque = cross(x - broadcast(center), f) + cross(m, field.h);
     add_where(mask, wrench.force, f);
-    add_where(mask, wrench.torque, turn);
+    add_where(mask, wrench.torque, torque);
     wrench.energy -= mask ? dot(m, field.h) : 0;
 }
 // Adds sign × (force, torque) to six numbers.

@@ -95,7 +95,7 @@ class CellCouplings:
         packed: All moments, packed (``packing.PackedMoments``).
         moments: Moments [A·m²], Warp array, shape [n].
         h: Field to add to [A/m], Warp array, shape [n].
-        whole: True for bodies with a collective response (``induction``), which :meth:`launch_others` leaves out,
+        collective: True for bodies with a collective response (``induction``), which :meth:`launch_others` leaves out,
             shape [bodies]; None means no such body.
 
     Attributes:
@@ -105,13 +105,13 @@ class CellCouplings:
         entries: Pairs of cells per evaluation.
     """
 
-    def __init__(self, bodies, worlds, packed, moments, h, whole=None):
+    def __init__(self, bodies, worlds, packed, moments, h, collective=None):
         """Lay out the tables on the device of the moments."""
         dtype = packed.dtype
         self._couplings = c = couplings_type(dtype)()
         c.moments, c.h, c.packed = moments, h, packed.packed
         c.overlap, c.overlap_count = packed.overlaps, packed.overlap_counts
-        other_chunks = self._lay_out(bodies, whole, np.asarray(worlds), dtype, h.device)
+        other_chunks = self._lay_out(bodies, collective, np.asarray(worlds), dtype, h.device)
         self.rotations, self.entries = c.rotation, sum(len(coupling.other) for _, coupling in bodies)
         self.hardness = c.hardness
         self._start = self._record(c, HARDEN, HARDEN)
@@ -136,12 +136,12 @@ class CellCouplings:
         kernel = _kernel(couplings.packed.dtype, group)
         return launch_passes(kernel, first, last + 1, couplings, device=device, record_cmd=True, **sizes)
 
-    def _lay_out(self, bodies, whole, worlds, dtype, device) -> int:
+    def _lay_out(self, bodies, collective, worlds, dtype, device) -> int:
         """Fill the arrays; return the number of chunks of bodies without a collective response, which come first."""
         c, first_rows, tables, positions, chunks, body, other_chunks = self._couplings, {}, [], [], [], [], 0
         self.rows = np.zeros(len(bodies), int)
-        whole = np.zeros(len(bodies), bool) if whole is None else np.asarray(whole, bool)
-        for number in np.argsort(whole, kind="stable").tolist():
+        collective = np.zeros(len(bodies), bool) if collective is None else np.asarray(collective, bool)
+        for number in np.argsort(collective, kind="stable").tolist():
             first, coupling = bodies[number]
             if id(coupling) not in first_rows:
                 first_rows[id(coupling)] = CHUNK * sum(len(slots) for slots, _, _ in tables)
@@ -153,7 +153,7 @@ class CellCouplings:
             starts = range(0, count, CHUNK)
             chunks += [(first + k, min(CHUNK, count - k), row, first_rows[id(coupling)]) for k in starts]
             body += [number] * len(starts)
-            other_chunks += 0 if whole[number] else len(starts)
+            other_chunks += 0 if collective[number] else len(starts)
         slots, others, tensors = (np.concatenate(parts) for parts in zip(*tables, strict=True))
 
         def put(values, kind):

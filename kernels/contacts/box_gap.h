@@ -13,8 +13,8 @@ template <class Arrays> CUDA_CALLABLE inline bool are_boxes(const Arrays& arrays
 template <class Arrays> CUDA_CALLABLE inline Real largest_motion(const Arrays& arrays, int box) {
     const int body = arrays.body.data[box];
     if (body < 0 || arrays.displacement.shape[0] == 0) return 0;
-    const Real turn = arrays.dt * wp::length(wp::spatial_bottom(arrays.body_qd.data[body]));
-    return wp::length(arrays.displacement.data[box]) + turn * wp::length(arrays.scale.data[box]);
+    const Real angle = arrays.dt * wp::length(wp::spatial_bottom(arrays.body_qd.data[body]));
+    return wp::length(arrays.displacement.data[box]) + angle * wp::length(arrays.scale.data[box]);
 }
 
 // Distance up to which contacts of two boxes are detected, with a margin for float32 rounding [m].

@@ -257,7 +257,7 @@ CUDA_CALLABLE inline void place_targets(int thread, int threads, Word* team, con
 #if defined(__CUDA_ARCH__)
     if (thread < arrays.shape.shape[0]) place_target(arrays, thread);
 #else
-    share_out(team, threads, arrays.shape.shape[0], TARGETS_AT_ONCE, [&](int t) { place_target(arrays, t); });
+    share_items(team, threads, arrays.shape.shape[0], TARGETS_AT_ONCE, [&](int t) { place_target(arrays, t); });
     find_search_distance(arrays.lists);
     bound_boxes(arrays);
 #endif
@@ -297,7 +297,7 @@ CUDA_CALLABLE inline void find_pairs(int thread, int threads, Word* team, const 
         const int first = chunk * TARGETS_AT_ONCE, last = first + TARGETS_AT_ONCE;
         for (int t = first; t < (last < targets ? last : targets); ++t) visit(t);
     };
-    share_out(team, threads, chunks, 1, [&](int chunk) {
+    share_items(team, threads, chunks, 1, [&](int chunk) {
         int count[2] = {}; // of pairs and contacts
         each_target(chunk, [&](int t) {
             store_list_radius(arrays, t);
@@ -318,7 +318,7 @@ CUDA_CALLABLE inline void find_pairs(int thread, int threads, Word* team, const 
         }
     arrays.pair_count.data[0] = total[0];
     if (total[1]) arrays.contacts.count.data[0] = total[1];
-    share_out(team, threads, chunks, 1, [&](int chunk) {
+    share_items(team, threads, chunks, 1, [&](int chunk) {
         const int *const first = counts_of(chunk), *const next = chunk + 1 < chunks ? counts_of(chunk + 1) : total;
         int at[2] = {first[0], first[1]};
         const int count = next[0] - at[0] + next[1] - at[1];

@@ -197,11 +197,11 @@ CUDA_CALLABLE inline void keep_range(const Arrays& a, int b, int first, int last
     a.kept_range[2 * (size_t)b + 1] = last;
 }
 // Keeps a side of contact c for the next substep: its accumulated slip, and its point on the body of the first shape.
-CUDA_CALLABLE inline void keep_slip(const Arrays& a, int place, int c, const Real (&slip)[6]) {
-    Real* const kept = a.kept + KEPT_SIZE * (size_t)place;
+CUDA_CALLABLE inline void keep_slip(const Arrays& a, int side, int c, const Real (&slip)[6]) {
+    Real* const kept = a.kept + KEPT_SIZE * (size_t)side;
     for (int k = 0; k < 6; ++k) kept[k] = slip[k];
     for (int k = 0; k < 3; ++k) kept[6 + k] = a.point0[3 * (size_t)c + k];
-    a.kept_key[place] = a.pair_key(c);
+    a.kept_key[side] = a.pair_key(c);
 }
 // Reads the slip that contact c had accumulated on its second body at the end of the last substep. If the shapes
 // touched at several points, the slip of the nearest point is read. The slip is 0 if they did not touch, or if the kept
@@ -218,9 +218,9 @@ CUDA_CALLABLE inline void read_kept_slip(const Arrays& a, int c, Real (&slip)[6]
     const int searched = !a.movable(ends[0]) || (a.movable(ends[1]) && counts[1] <= counts[0]);
     const Real* nearest = nullptr;
     Real least = Real(1e30);
-    for (int place = ranges[searched][0]; place < ranges[searched][1]; ++place) {
-        if (a.kept_key[place] != a.pair_key(c)) continue;
-        const Real* const kept = a.kept + KEPT_SIZE * (size_t)place;
+    for (int side = ranges[searched][0]; side < ranges[searched][1]; ++side) {
+        if (a.kept_key[side] != a.pair_key(c)) continue;
+        const Real* const kept = a.kept + KEPT_SIZE * (size_t)side;
         Real square = 0;
         for (int k = 0; k < 3; ++k) {
             const Real apart = kept[6 + k] - a.point0[3 * (size_t)c + k];

@@ -62,9 +62,9 @@ __device__ inline void list_sides(int c, const Arrays& a) {
     if (c >= a.contact_count() || !find_bodies(a, c, ends)) return;
     for (int end = 0; end < 2; ++end) {
         if (!a.movable(ends[end])) continue;
-        const int place = a.range[2 * a.slot[ends[end]]] + atomicAdd(a.filled + ends[end], 1);
-        a.entry[place] = 2 * c + end;
-        a.key[place] = a.pair_key(c);
+        const int side = a.range[2 * a.slot[ends[end]]] + atomicAdd(a.filled + ends[end], 1);
+        a.entry[side] = 2 * c + end;
+        a.key[side] = a.pair_key(c);
     }
 }
 
@@ -88,7 +88,7 @@ __device__ inline void write_impulse_of(const Arrays& a, int k, const Accumulate
 // Contact of side k, stored in the second half of ``other``.
 __device__ inline int& contact_of(const Arrays& a, int k) { return a.other[2 * (size_t)a.contact_max + k]; }
 
-// Prepares the side of list entry k and writes it to its place in the sorted list of its body.
+// Prepares the side of list entry k and writes it to its rank in the sorted list of its body.
 __device__ inline void write_side(int k, const Arrays& a, Real relaxation, Real dt) {
     if (k >= a.totals[SIDES]) return;
     const int c = a.entry[k] / 2, end = a.entry[k] % 2;
@@ -96,19 +96,19 @@ __device__ inline void write_side(int k, const Arrays& a, Real relaxation, Real 
     find_bodies(a, c, ends);
     const int slot = a.slot[ends[end]], first = a.range[2 * slot], last = a.range[2 * slot + 1];
     const unsigned long long key = a.key[k];
-    int place = first;
+    int rank = first;
     for (int m = first; m < last; ++m) {
-        if (a.key[m] != key) place += a.key[m] < key;
+        if (a.key[m] != key) rank += a.key[m] < key;
         else if (m != k) {
             const int d = a.entry[m] / 2;
-            place += comes_before(a, d, c) || (m < k && !comes_before(a, c, d));
+            rank += comes_before(a, d, c) || (m < k && !comes_before(a, c, d));
         }
     }
     Real detected[CONTACT_SIZE];
     write_detected(a, c, end, detected, 1);
     const int other = a.line_of_body(ends[1 - end]);
-    a.other[place] = other;
-    contact_of(a, place) = c;
+    a.other[rank] = other;
+    contact_of(a, rank) = c;
     Real s[6];
     read_kept_slip(a, c, s);
     const Real sign = end == 1 ? 1 : -1;
@@ -120,11 +120,11 @@ __device__ inline void write_side(int k, const Arrays& a, Real relaxation, Real 
     const Contact contact = prepare_contact(side, read_pose(fours(a.pose, slot)), read_pose(fours(a.pose, other)),
                                             read_body(own_motion), read_body(other_motion), read_inertia(own_motion),
                                             read_inertia(other_motion), slip, relaxation, dt);
-    write_contact(contact, [&](int quarter, Four f) { put_four(a.side, quarter, place, f); });
+    write_contact(contact, [&](int quarter, Four f) { put_four(a.side, quarter, rank, f); });
     if (a.totals[FRICTIONAL])
         write_slip(contact.return_velocity,
-                   [&](int half, Four f) { ((Four*)a.return_velocity)[RETURN_SIZE / 4 * (size_t)place + half] = f; });
-    write_impulse_of(a, place, {});
+                   [&](int half, Four f) { ((Four*)a.return_velocity)[RETURN_SIZE / 4 * (size_t)rank + half] = f; });
+    write_impulse_of(a, rank, {});
 }
 
 // Sums of impulses and angular impulses on a body, over the threads that share it.

@@ -345,7 +345,7 @@ template <Step S, Quantity Q, class Word, class Arrays>
 void expansion_step(int, int threads, Word* team, const Arrays& a) {
     const int levels = a.counts.data[0], *const begin = a.level_begin.data;
     const auto for_range = [&](const int* run, auto work) {
-        share_out(team, threads, run[1] - run[0], 4, [&](int i) { work(run[0] + i); });
+        share_items(team, threads, run[1] - run[0], 4, [&](int i) { work(run[0] + i); });
     };
     const auto visit = [&](int height, auto work) { for_range(begin + height, work); };
     if constexpr (S == Step::UPWARD) {

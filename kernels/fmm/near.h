@@ -164,7 +164,7 @@ template <Quantity Q, class Arrays> void sum_leaf(const Arrays& arrays, int leaf
 // Sums all leaves of the range ``leaves``.
 template <Quantity Q, class Arrays> void sum_near(const Arrays& arrays, int threads, Word* team) {
     const int first = arrays.leaves.data[0], count = arrays.leaves.data[1] - first;
-    share_out(team, threads, count, 8, [&](int leaf) { sum_leaf<Q>(arrays, first + leaf); });
+    share_items(team, threads, count, 8, [&](int leaf) { sum_leaf<Q>(arrays, first + leaf); });
 }
 }
 #endif

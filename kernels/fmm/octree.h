@@ -430,7 +430,7 @@ CUDA_CALLABLE inline void build_octree(int thread, int count, int round, int thr
     if constexpr (has_last_step<P>())
         if (is_last_of(a.arrived.data, count)) finish_pass<P>(a, round);
 #else
-    share_out(team, threads, count, takes_blocks<P>() ? 8 : 8 * BLOCK, [&](int i) { run_item<P>(a, i); });
+    share_items(team, threads, count, takes_blocks<P>() ? 8 : 8 * BLOCK, [&](int i) { run_item<P>(a, i); });
     if constexpr (has_last_step<P>()) finish_pass<P>(a, round);
 #endif
 }

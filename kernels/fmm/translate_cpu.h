@@ -99,7 +99,7 @@ template <class Arrays> void translate(const Arrays& arrays, int threads, Word* 
         const int* const begin = arrays.octant_begin.data + i;
         if (i % 9 < 8) runs += (begin[1] - begin[0] + WIDE - 1) / WIDE;
     }
-    share_out(team, threads, runs, 1, [&](int index) {
+    share_items(team, threads, runs, 1, [&](int index) {
         const BoxRun boxes = box_run(arrays.octant_begin, WIDE, index);
         if (boxes.end - boxes.begin > WIDTH) translate_run<2>(arrays, boxes);
         else translate_run<1>(arrays, boxes);

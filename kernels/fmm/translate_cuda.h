@@ -43,9 +43,9 @@ CUDA_CALLABLE inline void find_sources(Stage& stage, const Arrays& arrays, int (
 // Starts an asynchronous copy of ``bytes``, a multiple of 16, to shared memory. wait_for_copies waits for the copies of
 // this thread.
 template <int THREADS> CUDA_CALLABLE inline void start_copy(void* to, const void* from, int bytes, int lane) {
-    const unsigned there = (unsigned)__cvta_generic_to_shared(to);
+    const unsigned address = (unsigned)__cvta_generic_to_shared(to);
     for (int i = 16 * lane; i < bytes; i += 16 * THREADS)
-        asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" : : "r"(there + i), "l"((const char*)from + i));
+        asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" : : "r"(address + i), "l"((const char*)from + i));
 }
 CUDA_CALLABLE inline void wait_for_copies() { asm volatile("cp.async.wait_all;" : : : "memory"); }
 

@@ -251,7 +251,7 @@ CUDA_CALLABLE inline void respond_all(int thread, bool begin, int threads, Word*
     __shared__ double parts[2 * MOST_CELLS * GROUP / 32];
     respond(state, bodies, thread / blockDim.x, begin, vectors, parts);
 #else
-    share_out(team, threads, bodies.body.shape[0], 1, [&](int b) {
+    share_items(team, threads, bodies.body.shape[0], 1, [&](int b) {
         Real vectors[3 * MOST_CELLS];
         respond(state, bodies, b, begin, vectors, nullptr);
     });

@@ -128,10 +128,10 @@ CUDA_CALLABLE inline Vector sum_forces(const NearArrays& a, int i, const Sources
         total += ((d.radial + q.radial) * u + q.across);
     }
     for (int s = share(); s - share() < contact_slots; s += SHARES) {
-        const int* place = list_at(a.counterpart, CONTACT_SLOTS, s, i);
+        const int* counterpart = list_at(a.counterpart, CONTACT_SLOTS, s, i);
         const Real* forces = a.pair_forces;
-        const Vector other_force = {gather(forces, place), gather(forces + CHUNK, place),
-                                    gather(forces + 2 * CHUNK, place)};
+        const Vector other_force = {gather(forces, counterpart), gather(forces + CHUNK, counterpart),
+                                    gather(forces + 2 * CHUNK, counterpart)};
         total += (other_force - own_vector(a.pair_force(s, i)));
     }
     return {group_total(total.x), group_total(total.y), group_total(total.z)};

@@ -60,7 +60,7 @@ def lists_type(dtype):
         # Buffers of a CPU, in the order of buckets:
         bucket: wp.array[int]  # first entry of each bucket, shape [2ᵏ + 1]
         entries: wp.array2d[int]  # index, cell's x and y, group; and the bucket of each moment, shape [5, n padded]
-        places: wp.array2d[dtype]  # positions and radii [m], shape [4, n padded]
+        balls: wp.array2d[dtype]  # positions and radii [m], shape [4, n padded]
 
     return NeighborLists
 
@@ -89,7 +89,7 @@ def allocate(count: int, packed, group, *, reach: float, ratio=1.0 + SKIN, capac
     lists.cell = wp.zeros(linked, dtype=wp.vec4i, device=device)
     lists.before = wp.zeros(linked, dtype=int, device=device)
     lists.entries = wp.zeros((5, padded), dtype=int, device=device)
-    lists.places = wp.zeros((4, padded), dtype=dtype, device=device)
+    lists.balls = wp.zeros((4, padded), dtype=dtype, device=device)
     return lists
 
 

@@ -22,7 +22,7 @@ struct SortedSources {
 
 template <class Lists> inline SortedSources sort_sources(const Lists& sources, double cells_per_meter) {
     const SortedSources s = {sources.bucket.shape[0] - 1, sources.entries.shape[1], sources.bucket.data,
-                             sources.entries.data, (Real*)sources.places.data};
+                             sources.entries.data, (Real*)sources.balls.data};
     const Balls balls = balls_of(sources);
     const int count = sources.packed.shape[1];
     __builtin_memset(s.begin, 0, (s.buckets + 1) * sizeof(int));
@@ -99,7 +99,7 @@ inline void search_neighbors(const Lists& targets, const Lists& sources, int thr
     const SortedSources sorted = sort_sources(sources, cells_per_meter);
     const Balls balls = balls_of(targets);
     const bool same = targets.count.data == sources.count.data;
-    share_out(team, threads, targets.packed.shape[1], TARGETS, [&](int i) {
+    share_items(team, threads, targets.packed.shape[1], TARGETS, [&](int i) {
         int list[CAPACITY + WIDTH];
         const Target target = {balls.x[i], balls.y[i], balls.z[i], balls.radius[i], (Real)targets.ratio, same ? i : -1};
         const int count = find_around(sorted, target, cell_of(balls, i, targets.group.data[i], cells_per_meter), list);
@@ -112,6 +112,6 @@ inline void search_neighbors(const Lists& targets, const Lists& sources, int thr
 
 template <class Lists>
 inline void list_overlaps_of_all(const Lists& targets, const Lists& sources, int threads, Word* team) {
-    share_out(team, threads, targets.packed.shape[1], TARGETS, [&](int i) { list_overlaps(targets, sources, i); });
+    share_items(team, threads, targets.packed.shape[1], TARGETS, [&](int i) { list_overlaps(targets, sources, i); });
 }
 }

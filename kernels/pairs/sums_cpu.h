@@ -377,7 +377,7 @@ template <Quantity Q> inline void sum_share(const Share& share) {
 template <Quantity Q, class Arrays> inline void sum_tiles(const Arrays& arrays, int threads, Word* team) {
     const TileEntry* const tiles = (const TileEntry*)arrays.tiles.data;
     const int* const shares = arrays.shares.data; // first tile of each share
-    share_out(team, threads, (int)arrays.shares.shape[0] - 1, 1, [&](int s) {
+    share_items(team, threads, (int)arrays.shares.shape[0] - 1, 1, [&](int s) {
         sum_share<Q>({arrays.targets, arrays.sources, arrays.effective, tiles + shares[s], tiles + shares[s + 1],
                       arrays.partial.data, (size_t)arrays.partial.shape[1]});
     });

@@ -117,7 +117,7 @@ template <class Work> void run_together(Word* team, int threads, Work& work) {
 #endif
 
 // Calls visit(i) for each of ``count`` items. Threads take ``share`` items at a time.
-template <class Visit> void share_out(Word* team, int threads, int count, int share, Visit visit) {
+template <class Visit> void share_items(Word* team, int threads, int count, int share, Visit visit) {
     int next = 0;
     auto work = [&](int) {
         for (;;) {
