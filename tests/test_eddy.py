@@ -252,7 +252,7 @@ def test_a_magnet_and_its_coil_move(device):
     whole, along = _wrenches(device, lambda body, place: (speed + np.cross(spin, place), spin))
     _, apart = _wrenches(device, lambda body, place: (body * speed, body * spin))
     _, turned = _wrenches(device, lambda body, place: (0.0 * speed, (1 - body) * 20.0 * spin))
-    noise = 1e-6 * np.abs(whole).max(axis=0)  # rounding of the forces, of which these are differences
+    noise = 1e-6 * np.abs(whole).max(axis=0)  # rounding of the forces whose differences these are
     assert (np.abs(along) < 5.0 * noise).all()
     for forces, power in ((apart, apart[1] @ [*speed, *spin]), (turned, turned[0, 3:] @ (20.0 * spin))):
         assert np.abs(forces).max() > 100.0 * noise.max()

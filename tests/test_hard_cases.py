@@ -70,8 +70,8 @@ CASES = {
     "no ball": lambda: Case(np.zeros((0, 3))),
     "touching balls": lambda: Case(fcc_block((4, 4, 4))),
     "overlapping balls": lambda: Case(_random(300, 0.04), 0.01),
-    "coincident centres": lambda: Case(np.repeat(_random(40, 0.1), 4, axis=0)),
-    "coincident centres under fields of their own": lambda: Case(
+    "coincident centers": lambda: Case(np.repeat(_random(40, 0.1), 4, axis=0)),
+    "coincident centers under fields of their own": lambda: Case(
         np.zeros((50, 3)), applied=_fields(50, 3e6), arguments={"max_evaluations": 300}
     ),
     "radii 1:100": _mixed_sizes,

@@ -129,7 +129,7 @@ def test_forces_are_the_gradient_of_the_energy():
 
 @pytest.mark.parametrize("field", [ALONG, ACROSS])
 def test_force_is_continuous_and_bounded(field):
-    """From beyond the cut-off through contact to coincident centres: steps half as long jump half as far."""
+    """From beyond the cut-off through contact to coincident centers: steps half as long jump half as far."""
 
     def force(distances):
         pairs = (np.array([0 * ALONG, d * ALONG]) for d in distances)

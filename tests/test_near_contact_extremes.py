@@ -48,7 +48,7 @@ def beside(ratio, depth):
     [(in_one_another, ratio) for ratio in (1.0, 1.000001, 1.2, 3.0, 1000.0)] + [(two_in_one, 5.0), (beside, 1.2)],
 )
 def test_balls_in_one_another(arrange, ratio, dtype, scale, device):
-    """Magnetizations and forces down to coincident centres are the reference's, which is in units of the radius."""
+    """Magnetizations and forces down to coincident centers are the reference's, which is in units of the radius."""
     # two ideally permeable balls in one place do not tell how they share their magnetization
     error = {"float64": 1e-8, "float32": 1e-3}[dtype]
     for depth in (0.0, 1e-15, 1e-9, 1e-6, 1e-3, 0.3, 0.51, 0.95):

@@ -244,7 +244,7 @@ def test_saturated_balls_are_dipoles(curve, device):
 
 
 def test_force_is_continuous(device):
-    """From beyond the reach through contact to coincident centres: steps half as long jump half as far."""
+    """From beyond the reach through contact to coincident centers: steps half as long jump half as far."""
     magnets = system([R, 0.5 * R], device)
 
     def forces(distances):

@@ -44,11 +44,11 @@ def test_balls_of_balls_up_touch_nothing(tmp_path):
     stage = open_stage(path)
     magnets = read_magnets(stage).magnets
     balls = [UsdGeom.Sphere.Get(stage, name) for name, magnet in magnets.items() if magnet.kind == "inducible"]
-    centres = np.array([ball.ComputeLocalToWorldTransform(0.0).ExtractTranslation() for ball in balls])
-    distances = np.linalg.norm(centres[:, None] - centres[None], axis=2)[~np.eye(60, dtype=bool)]
-    assert len(balls) == 60 and centres[:, 2].min() == pytest.approx(0.003)
+    centers = np.array([ball.ComputeLocalToWorldTransform(0.0).ExtractTranslation() for ball in balls])
+    distances = np.linalg.norm(centers[:, None] - centers[None], axis=2)[~np.eye(60, dtype=bool)]
+    assert len(balls) == 60 and centers[:, 2].min() == pytest.approx(0.003)
     assert 2.0 * 0.003 < distances.min() < 2.01 * 0.003
-    np.testing.assert_allclose(centres[:, :2].mean(axis=0), 0.0, atol=1e-12)
+    np.testing.assert_allclose(centers[:, :2].mean(axis=0), 0.0, atol=1e-12)
 
 
 def test_a_magnet_inside_the_stack_is_refused(tmp_path):

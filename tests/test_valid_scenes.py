@@ -301,7 +301,7 @@ def test_two_letters_at_one_place_come_apart_and_a_line_says_why(device, tmp_pat
     assert np.isfinite(velocities).all()
     # masses are equal; what pushes letters apart rounds as speeds up to the fastest on the way do
     np.testing.assert_allclose(velocities.sum(axis=0), 0.0, atol=1e-4 * simulation.finish().peak_speed)
-    assert np.abs(velocities).max() < 2.0 * RECOVERY_SPEED  # of points; centres may go faster than these
+    assert np.abs(velocities).max() < 2.0 * RECOVERY_SPEED  # of points; centers may be faster
 
 
 def test_what_leaves_all_finite_numbers_is_told_with_what_was_wrong_before(device, tmp_path):

@@ -21,7 +21,7 @@ from warpmag.kernels.rigid.newton_views import BodyView, ContactView, contact_bo
 
 wp.set_module_options({"enable_backward": False})
 
-ENTRIES = 36  # entries of G, of which those on and above the diagonal are used
+ENTRIES = 36  # entries of G; those on and above the diagonal are used
 _STABLE_RELAXATION = wp.constant(2.0 * (1.0 + MOMENTUM) / (1.0 + 2.0 * MOMENTUM))
 _TOUCHING_GAP = wp.constant(0.1)
 """Distance up to which open contacts count, relative to the sum of their shapes' contact gaps."""

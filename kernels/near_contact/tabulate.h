@@ -131,13 +131,13 @@ CUDA_CALLABLE inline void tabulate_contact(const NearArrays& arrays, int i, int 
 // Finds the index of the other ball's part of a contact's force. If there is none, it is the index of the last entries,
 // which are zero.
 CUDA_CALLABLE inline void find_counterpart(const NearArrays& a, int i, int s, int j) {
-    int found = -1;
+    int other_slot = -1;
     auto takes_part = [&](int ball) { return a.positions[LINE * (size_t)ball + 4] > 0; };
     if (s < a.contact_count[i] && takes_part(i) && takes_part(j))
         for (int slot = 0; slot < a.contact_count[j]; ++slot)
-            found = *list_at(a.near, NEAR_SLOTS, slot, j) == i ? slot : found;
+            other_slot = *list_at(a.near, NEAR_SLOTS, slot, j) == i ? slot : other_slot;
     *list_at(a.counterpart, CONTACT_SLOTS, s, i) =
-        found < 0 ? CONTACT_SLOTS * 3 * a.balls : (int)(a.pair_force(found, j) - a.pair_forces);
+        other_slot < 0 ? CONTACT_SLOTS * 3 * a.balls : (int)(a.pair_force(other_slot, j) - a.pair_forces);
 }
 
 // Sets the state of balls without near balls to zero, so that they start cold when they have one again.
