@@ -119,17 +119,17 @@ def _shift_terms(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
     """
     n, m, sine = degrees(degree), np.abs(orders(degree)), orders(degree) < 0
     k, j, target_sine = n[:, None], m[:, None], sine[:, None]
-    crossed = target_sine != sine  # the harmonic at the offset has a sine
+    has_sine = target_sine != sine  # the harmonic at the offset has a sine
     sum_degree, sum_order, difference = k + n, m + j, np.abs(m - j)
     sign = np.where(k % 2, -1.0, 1.0) * _irregular_scales(degree) / _scales(degree)[:, None]
     added = sign * np.where(target_sine & sine, -1, 1)
     subtracted = sign * np.where(target_sine & ~sine, -1, 1) * np.where(j % 2, -1, 1)
     # a harmonic of negative order m − |j| is (−1)^(m − j) times the conjugate
-    subtracted = subtracted * np.where(m < j, np.where(difference % 2, -1, 1) * np.where(crossed, -1, 1), 1)
-    subtracted = np.where((j == 0) | (crossed & (difference == 0)), 0, subtracted)
-    side = np.where(crossed, -1, 1)
-    of_added = sum_degree * sum_degree + sum_degree + side * sum_order
-    of_subtracted = sum_degree * sum_degree + sum_degree + side * difference
+    subtracted = subtracted * np.where(m < j, np.where(difference % 2, -1, 1) * np.where(has_sine, -1, 1), 1)
+    subtracted = np.where((j == 0) | (has_sine & (difference == 0)), 0, subtracted)
+    order_sign = np.where(has_sine, -1, 1)
+    of_added = sum_degree * sum_degree + sum_degree + order_sign * sum_order
+    of_subtracted = sum_degree * sum_degree + sum_degree + order_sign * difference
     scales = _irregular_scales(2 * degree)
     return added / scales[of_added], subtracted / scales[of_subtracted], of_added, of_subtracted
 

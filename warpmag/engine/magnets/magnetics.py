@@ -221,7 +221,7 @@ class Magnetics:
         values, system = self._values, self.system
         self._induced = True
         gather_moments(
-            *(state.body_q, self._body_moments, values.now, values.then, system.positions, system.moments),
+            *(state.body_q, self._body_moments, values.present, values.used, system.positions, system.moments),
             values.changed,
         )
         values.check(wait=False)

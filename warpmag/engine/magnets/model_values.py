@@ -38,7 +38,7 @@ def magnetic_arrays(model: newton.Model) -> dict[str, Any]:
 
 
 class ModelValues:
-    """The attributes of a model's magnets, ``now``, and copies as ``Magnetics`` last read them, ``then``.
+    """The ``present`` attributes of a model's magnets, and copies of what ``Magnetics`` last read of them, ``used``.
 
     On the device, ``changed`` is 1 + the index of a changed shape, or 0, shape [1].
     """
@@ -46,11 +46,11 @@ class ModelValues:
     def __init__(self, model: newton.Model, *, measured: bool):
         """Copy the values of ``model``; ``measured`` means that one measured curve replaces all curves."""
         self._model, self._measured = model, measured
-        self.now, self.then = ShapeMagnets(), ShapeMagnets()
+        self.present, self.used = ShapeMagnets(), ShapeMagnets()
         for name in _COMPARED:
             array = getattr(getattr(model, NAMESPACE), name)
-            setattr(self.now, name, array)
-            setattr(self.then, name, wp.clone(array))
+            setattr(self.present, name, array)
+            setattr(self.used, name, wp.clone(array))
         self.changed = wp.zeros(1, dtype=wp.int32, device=model.device)
         self._changed_on_host = self.changed
         if self.changed.device.is_cuda:
@@ -74,9 +74,9 @@ class ModelValues:
 
     def _differing(self, name: str) -> np.ndarray:
         """Return the magnetic shapes with a changed value of one attribute."""
-        now, then = getattr(self.now, name).numpy(), getattr(self.then, name).numpy()
-        is_magnet = (self.now.kind.numpy() != NO_MAGNET) | (name == "kind")
-        return np.flatnonzero((now != then) & is_magnet)
+        present, used = getattr(self.present, name).numpy(), getattr(self.used, name).numpy()
+        is_magnet = (self.present.kind.numpy() != NO_MAGNET) | (name == "kind")
+        return np.flatnonzero((present != used) & is_magnet)
 
     def changed_materials(self) -> np.ndarray:
         """Return the shapes with a changed material; raise :class:`InputError` if the change is not possible."""
@@ -86,26 +86,28 @@ class ModelValues:
                 subject = f"{labels[shape]}: {NAMESPACE}.{name}"
                 if name not in _MATERIAL:
                     raise InputError(f"{subject} was changed, and its Magnetics cannot follow: make another")
-                if self._measured or self.now.curve.numpy()[shape] >= len(CURVES):
+                if self._measured or self.present.curve.numpy()[shape] >= len(CURVES):
                     raise InputError(f"{subject} was changed, but a measured curve determines it")
                 assert row.check is not None, "only tokens have no check"
-                row.check(subject, float(getattr(self.now, name).numpy()[shape]))
+                row.check(subject, float(getattr(self.present, name).numpy()[shape]))
         return np.unique(np.concatenate([self._differing(name) for name in _MATERIAL]))
 
     def material(self, shapes) -> tuple[np.ndarray, np.ndarray]:
         """Return the present saturations [A/m] and susceptibilities of shapes."""
         saturation, susceptibility = (
-            getattr(self.now, name).numpy()[shapes].astype(float) for name in ("saturation", "susceptibility")
+            getattr(self.present, name).numpy()[shapes].astype(float) for name in ("saturation", "susceptibility")
         )
         return saturation, susceptibility
 
     def persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays of changeable attributes by name, for a checkpoint."""
-        return {f"{when}.{name}": getattr(getattr(self, when), name) for when in ("now", "then") for name in _MATERIAL}
+        return {
+            f"{when}.{name}": getattr(getattr(self, when), name) for when in ("present", "used") for name in _MATERIAL
+        }
 
     def accept_changes(self) -> None:
         """Copy the present values of the model, and clear :attr:`changed`."""
         for name in _COMPARED:
-            wp.copy(getattr(self.then, name), getattr(self.now, name))
+            wp.copy(getattr(self.used, name), getattr(self.present, name))
         self.changed.zero_()
         self._changed_on_host.zero_()

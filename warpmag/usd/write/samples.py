@@ -45,7 +45,7 @@ class _Places:
     end_code: int  # place of the layer's ``endTimeCode``
     types: np.ndarray  # references of each attribute without the place of a value, shape [attributes]
     first_frames: np.ndarray  # first frame of each contiguous block of frames
-    stretches: np.ndarray  # place of each block
+    starts: np.ndarray  # place of each block
     sampled: np.ndarray  # True for each attribute with samples, shape [attributes]
     capacity: int = 0  # frames that fit in all blocks
     times: int = 0  # place of the number of frames, followed by their time codes; an empty list precedes, rows follow
@@ -161,7 +161,7 @@ class SampleFile:
         self._places = replace(
             old,
             first_frames=np.append(old.first_frames, old.capacity),
-            stretches=np.append(old.stretches, start),
+            starts=np.append(old.starts, start),
             capacity=capacity,
             times=empty + 8,
             filled=min(old.count + _FIRST_AHEAD, capacity),
@@ -197,7 +197,7 @@ class SampleFile:
         frames = np.arange(first, last)
         block = np.searchsorted(self._places.first_frames, frames, side="right") - 1
         inside = frames - self._places.first_frames[block]
-        return (self._places.stretches[block] + inside * self._frame_size).astype(np.uint64)
+        return (self._places.starts[block] + inside * self._frame_size).astype(np.uint64)
 
     def _fill_ahead(self) -> None:
         """Write references of frames beyond ``filled``, to as many rows as needed to finish all rows in time."""
