@@ -196,7 +196,7 @@ def _moments_of(shapes: Sequence[DrawnShape], sampled: int) -> tuple[np.ndarray,
         else:
             spacing = 0.0 if sampled <= _FINE_COUNT else float(np.cbrt(box.prod() / _COARSE_COUNT))
             try:
-                cells = lattice.fill(lattice.mesh(shape.points, triangles_of(shape.faces)), spacing)
+                cells = lattice.fill(lattice.mesh(shape.points, triangles_of(shape.points, shape.faces)), spacing)
                 part = cells.positions, cells.volumes, cells.inner_radii
             except InputError:  # an open mesh counts as its bounding box
                 part = np.array([shape.center]), np.array([box.prod()]), np.array([0.5 * box.min()])
@@ -210,7 +210,7 @@ def _seeds(shapes: Sequence[DrawnShape], moment: np.ndarray, count: int, offset:
         (shape.center + shape.radius * BALL[0], BALL[1]) if shape.radius else (shape.points, shape.faces)
         for shape in shapes
     ]
-    triangles = np.concatenate([points[triangles_of(faces)] for points, faces in surfaces])
+    triangles = np.concatenate([points[triangles_of(points, faces)] for points, faces in surfaces])
     areas = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     charge = np.cumsum(np.maximum(areas @ (moment / np.linalg.norm(moment)), 0.0))
     order = np.arange(count) + 0.5

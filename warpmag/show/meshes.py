@@ -1,11 +1,12 @@
 """Meshes of the solids of UsdGeom: importers, such as Blender's, drop the materials of spheres and cubes."""
 
 import functools
-import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from pxr import Gf, Usd, UsdGeom, Vt
+
+from warpmag.shapes.polygons import triangulate
 
 _AROUND = 48
 """Corners of a ball's equator and of other circles."""
@@ -86,9 +87,10 @@ def corner_normals(points: np.ndarray, faces: Sequence[np.ndarray]) -> np.ndarra
     return sums / np.linalg.norm(sums, axis=1, keepdims=True)
 
 
-def triangles_of(faces: Iterable[Sequence[int] | np.ndarray]) -> np.ndarray:
-    """Return the triangles of polygons, as fans from their first corners, shape [k, 3]."""
-    return np.array([(face[0], a, b) for face in faces for a, b in itertools.pairwise(face[1:])])
+def triangles_of(points: np.ndarray, faces: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the triangles of polygons with the given points, shape [k, 3]."""
+    corners = np.concatenate(faces)
+    return corners[triangulate(points, np.array([len(face) for face in faces]), corners)]
 
 
 def revolved(profile: np.ndarray, around: int = _AROUND) -> Shape:

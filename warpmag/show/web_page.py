@@ -4,7 +4,6 @@ import contextlib
 import functools
 import html
 import io
-import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -215,8 +214,8 @@ def _corners(points: np.ndarray, faces: list[np.ndarray]) -> tuple[np.ndarray, n
     """Return points, normals and triangles of a surface; points of sharp edges occur once per side."""
     corners = np.c_[points[np.concatenate(faces)], corner_normals(points, faces)].astype(np.float32)
     vertices, indices = np.unique(np.round(corners, 6), axis=0, return_inverse=True)
-    starts = np.cumsum([0, *(len(face) for face in faces)]).tolist()
-    triangles = triangles_of([range(start, end) for start, end in itertools.pairwise(starts)])
+    separate = np.split(np.arange(len(corners)), np.cumsum([len(face) for face in faces])[:-1])
+    triangles = triangles_of(points[np.concatenate(faces)], separate)
     return vertices[:, :3], vertices[:, 3:], indices.reshape(-1)[triangles].astype(np.uint32)
 
 

@@ -11,6 +11,7 @@ from warpmag.usd.read.ball_instancers import BallInstancer, ball_instancers
 from warpmag.usd.read.check import StageReport, check, inspect
 from warpmag.usd.read.clock import StageClock, stage_clock
 from warpmag.usd.read.coils import author_coil, author_field_map, is_source, placed_sources, world_matrix_at
+from warpmag.usd.read.concave_faces import triangulate_concave_faces
 from warpmag.usd.read.identical_balls import MOMENTS_PRIMVAR, BallFrames, IdenticalBalls
 from warpmag.usd.read.input_errors import newton_errors, usd_errors
 from warpmag.usd.read.instancers import complete_instances
@@ -30,5 +31,5 @@ __all__ = [
     "complete_instances", "describe", "enabled_joint_paths", "first_camera", "freeze", "give_densities", "has_volume",
     "inspect", "is_source", "magnet_of", "newton_errors", "open_animated", "open_deferred", "open_stage",
     "placed_sources", "prepare_joints", "read_magnets", "read_recording", "shape_axis", "stage_clock", "survey",
-    "usable_path", "usd_errors", "world_matrix_at",
+    "triangulate_concave_faces", "usable_path", "usd_errors", "world_matrix_at",
 ]  # fmt: skip

@@ -35,6 +35,7 @@ from warpmag.usd import (
     open_deferred,
     prepare_joints,
     shape_axis,
+    triangulate_concave_faces,
     usd_errors,
 )
 
@@ -92,6 +93,7 @@ def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, art
     assert clock is not None, "an invalid clock is an error of the report"
     grounded = prepare_joints(stage, articulations=articulations)
     give_densities(stage, contents.magnets)
+    triangulate_concave_faces(stage, visuals=visuals)
     builder = StageBuilder()
     declare_attributes(builder)
     with newton_errors(str(path), "import"):

@@ -7,6 +7,7 @@ from pxr import Usd, UsdGeom
 
 from warpmag.errors import InputError
 from warpmag.shapes import lattice
+from warpmag.shapes.polygons import triangulate
 from warpmag.usd.values import LARGEST_COORDINATE, LARGEST_SIZE, SMALLEST_SIZE, Finding, finding_of, value_of
 
 _SIZES = ("radius", "radiusTop", "radiusBottom", "size", "height")
@@ -31,7 +32,7 @@ def magnet_findings(prim: Usd.Prim) -> Iterator[Finding]:
         return
     points, counts, indices = (np.asarray(value) for value in _topology(prim)[:3])
     try:
-        lattice.mesh(points.astype(float) @ _axes(prim), _triangles(counts, indices))
+        lattice.mesh(points.astype(float) @ _axes(prim), indices[triangulate(points, counts, indices)])
     except InputError as error:
         approximation = prim.GetAttribute("physics:approximation").Get()
         if approximation in _AS_DRAWN:
@@ -113,13 +114,6 @@ def _topology_fault(vertices: int, counts, indices, holes) -> str:
     if len(wrong):
         return f"holeIndices name face {wrong[0]}, but there are faces 0 to {len(counts) - 1} only"
     return ""
-
-
-def _triangles(counts: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Return the triangles of polygons, as fans around their first corners."""
-    starts = np.repeat(np.cumsum(counts) - counts, counts - 2)
-    offsets = np.arange(len(starts)) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
-    return np.stack([indices[starts], indices[starts + offsets + 1], indices[starts + offsets + 2]], axis=1)
 
 
 def _axes(prim) -> np.ndarray:

@@ -8,11 +8,12 @@ import math
 from collections.abc import Container, Iterator
 from dataclasses import dataclass
 
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
+from pxr import Gf, Tf, Usd, UsdGeom, UsdPhysics
 
 from warpmag.declarations.checks import joint_ends_apart, joint_gap_message
 from warpmag.errors import InputError
 from warpmag.usd.read.prims import body_of
+from warpmag.usd.read.session import editable
 from warpmag.usd.read.transforms import TransformCheck
 from warpmag.usd.values import Finding, value_of
 
@@ -132,7 +133,7 @@ def prepare_joints(stage: Usd.Stage, *, articulations: bool = True) -> list[Grou
         if not (axes or swapped or len(fixed_ends) == 2):
             continue
         with Usd.EditContext(stage, stage.GetSessionLayer()):
-            joint = UsdPhysics.Joint(_editable(stage, path))
+            joint = UsdPhysics.Joint(editable(stage, path))
             for axis in axes:
                 limit = UsdPhysics.LimitAPI.Apply(joint.GetPrim(), axis)
                 limit.CreateLowAttr(-math.inf)
@@ -151,16 +152,7 @@ def _drop_articulations(stage: Usd.Stage) -> None:
         if prim.HasAPI(UsdPhysics.ArticulationRootAPI) and prim.GetAttribute(_SELF_COLLISION).Get() is not False:
             with Usd.EditContext(stage, stage.GetSessionLayer()):
                 for schema in _ROOTS:
-                    _editable(stage, path).RemoveAppliedSchema(schema)
-
-
-def _editable(stage: Usd.Stage, path: Sdf.Path) -> Usd.Prim:
-    """Return the prim at ``path``, with the instances around it made editable."""
-    while (prim := stage.GetPrimAtPath(path)).IsInstanceProxy():
-        while prim.IsInstanceProxy():
-            prim = prim.GetParent()
-        prim.SetInstanceable(False)
-    return prim
+                    editable(stage, path).RemoveAppliedSchema(schema)
 
 
 def _free_axes(joint: Usd.Prim) -> list[str]:

@@ -55,6 +55,15 @@ def release(stage: Usd.Stage, layer: Sdf.Layer, instances: list[Sdf.Path]) -> No
         raise InputError(str(finding))
 
 
+def editable(stage: Usd.Stage, path: Sdf.Path) -> Usd.Prim:
+    """Return the prim at ``path``, with the instances around it made editable in the edit target of the stage."""
+    while (prim := stage.GetPrimAtPath(path)).IsInstanceProxy():
+        while prim.IsInstanceProxy():
+            prim = prim.GetParent()
+        prim.SetInstanceable(False)
+    return prim
+
+
 def instances_around(prims: Iterable[Usd.Prim]) -> list[Usd.Prim]:
     """Return the instances at or above prims, each once."""
     instances = {}
