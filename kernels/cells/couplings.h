@@ -1,12 +1,11 @@
 // Corrections of the field between cells of one body, H_i += Σ T_ij m_j, with tensors T_ij in the body's frame.
 //
 // Three passes: TURN rotates moments into the frame of their body; SHARE computes the low-order fields that all cells
-// of a body share; ADD sums the tensors' fields and rotates them into the world. At the start of a solve HARDEN raises
-// the demagnetizing factors of cells that overlap cells of other bodies. On a CPU a pass works on a vector of cells, on
-// a GPU a group of threads has one cell. From Python: CAPACITY and GROUP. ``Couplings`` is the struct of couplings.py.
+// of a body share; ADD sums the tensors' fields and rotates them into the world. On a CPU a pass works on a
+// vector of cells, on a GPU a group of threads has one cell. ``Couplings`` is the struct of couplings.py.
 #pragma once
 #include "cells/rotation.h"
-#include "pairs/neighbor_lists.h"
+#include "shared/group.h"
 #include "shared/team.h"
 
 namespace warpmag {
@@ -14,7 +13,7 @@ namespace warpmag {
 constexpr int TENSOR = 6; // xx, yy, zz, xy, xz, yz
 constexpr int COMMON = 8; // low-order fields that all cells of a body share; as in couplings.py
 
-enum CellPass { HARDEN, TURN, SHARE, ADD }; // as in couplings.py
+enum CellPass { TURN, SHARE, ADD }; // as in couplings.py
 
 // Σ T_ij m_j of the cells at ``row`` of the tables. All lists of a chunk have the length of the longest.
 template <class Couplings>
@@ -75,37 +74,18 @@ template <class Couplings> CUDA_CALLABLE inline void share_field(const Couplings
     }
 }
 
-// Increase of cells' demagnetizing factors where they overlap cells of other bodies, over the cells' volume [1/m³].
-template <class Couplings>
-CUDA_CALLABLE inline Number hardness_of(const Couplings& c, int chunk, int i, int lane_count) {
-    const Real* const packed = (const Real*)c.packed.data;
-    const size_t pitch = c.packed.strides[0] / sizeof(Real);
-    const Real *const radii = packed + 3 * pitch, *const labels = packed + 7 * pitch;
-    auto of_other_body = [=](Index a, Index b) { return mask_of(collect(labels, a) != collect(labels, b)); };
-    const auto& world = c.world.data[chunk]; // range of inducible moments
-    const Number volume = shared_volumes(c, i, lane_count, world[0], world[1], of_other_body),
-                 radius = numbers_or(radii + i, lane_count, 1);
-    const Real hardening = c.hardening.data[c.body.data[chunk]];
-    return hardening * Real(1 / 4.18879020478639) * volume / (radius * radius * radius);
-}
-
 // Makes a pass over the cells from ``row`` on.
 template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Couplings& c, int pass, int row) {
     const auto& chunk = c.chunk.data[row / CHUNK]; // first moment, count, first row of the body, first row of its table
     const int offset = row % CHUNK, left = chunk[1] - offset, lane_count = left < 0 ? 0 : left > WIDTH ? WIDTH : left;
     if (lane_count == 0) return;
     const int i = chunk[0] + offset;
-    if (pass == HARDEN) {
-        const Number hardness = hardness_of(c, row / CHUNK, i, lane_count);
-        if (share() == 0) put(c.hardness.data + row, hardness);
-        return;
-    }
     const int body = c.body.data[row / CHUNK];
     if (pass == SHARE) {
         if (row == c.rows.data[body][0]) share_field(c, body);
         return;
     }
-    const Rotation rotation = rotation_of(c.rotation.data[body]);
+    const Rotation<Real> rotation = rotation_of<Real>(c.rotation.data[body]);
     Real* const own = c.body_moments.data + row;
     const size_t pitch = c.body_moments.strides[0] / sizeof(Real);
     if (pass == TURN) {
@@ -119,12 +99,11 @@ template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Coupli
     const int table_row = row - chunk[2] + chunk[3];
     const Vector sums = sum_entries(c, c.body_moments.data + chunk[2], table_row);
     if (share() != 0) return;
-    const Vector m = {numbers(own), numbers(own + pitch), numbers(own + 2 * pitch)};
     const size_t stride = c.position.strides[0] / sizeof(Real);
     const Real* const at = c.position.data + table_row;
     const Vector position = {numbers(at), numbers(at + stride), numbers(at + 2 * stride)};
     const Vector common = common_field(c.common.data + (size_t)body * COMMON, position);
-    const Vector h = sums + common - numbers(c.hardness.data + row) * m;
+    const Vector h = sums + common;
     Real* const field = (Real*)c.h.data + 3 * (size_t)i;
     put_vectors(field, lane_count, vectors(field, lane_count) + to_world(rotation, h));
 }

@@ -3,13 +3,6 @@
 A table belongs to a shape and serves all bodies of that shape. It has a list of entries for each cell. Chunks of
 ``native.CHUNK`` cells are stored side by side, with as many slots as the longest list of the chunk.
 :func:`couplings_type` has the arrays.
-
-Cells of different bodies act on each other as balls. Where bodies intersect, this would make the operator of induction
-indefinite, with several solutions. So the demagnetizing factor of a cell grows by the fraction of its volume that
-overlaps cells of other bodies, times ``Coupling.hardening``. That is the largest reduction of a demagnetizing factor by
-the couplings of the body: 0.1 for a cube, 0.2 for a ball, more for thin sheets. It sufficed in all 140 arrangements
-that were tried, coincident bodies among them. Cubes that only touch overlap by a tenth of a cell, so that the
-demagnetizing factor of these cells grows by 0.01.
 """
 
 from functools import cache
@@ -17,13 +10,12 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
 COMMON = 8  # low-order fields that all cells of a body share: three uniform and five linear ones; as in ``couplings.h``
-HARDEN, TURN, SHARE, ADD = range(4)  # the passes, in order; as in ``couplings.h``
+TURN, SHARE, ADD = range(3)  # the passes, in order; as in ``couplings.h``
 _CELLS_PER_THREAD = 500  # cells per thread of a CPU, at least
 
 
@@ -42,20 +34,14 @@ def couplings_type(dtype):
         # Model: bodies
         chunk: wp.array[wp.vec4i]  # first moment, count, first row of the body, first row of its table, shape [chunks]
         body: wp.array[int]  # body of a chunk, shape [chunks]
-        world: wp.array[wp.vec2i]  # range of the inducible moments of a chunk's world, shape [chunks]
         rows: wp.array[wp.vec2i]  # range of rows of each body, shape [bodies]
         matrix: wp.array[dtype]  # COMMON × COMMON matrix from moments to low-order coefficients [1/m³], per body
-        hardening: wp.array[dtype]  # demagnetizing factor of a cell entirely within another body [1], shape [bodies]
         # Data in:
         rotation: wp.array[quaternion]  # from each body's frame to the world (x, y, z, w), shape [bodies]
         moments: wp.array[vec3]  # [A·m²], consecutive for a body, shape [n]
-        packed: wp.array2d[dtype]  # packed moments and their overlap lists (``packing.PackedMoments``)
-        overlap: wp.array2d[int]
-        overlap_count: wp.array[int]
         # Data out:
         body_moments: wp.array2d[dtype]  # moments in the frames of their bodies, shape [3, chunks · CHUNK]
         common: wp.array[dtype]  # low-order coefficients in the frame of the body [A/m], COMMON per body
-        hardness: wp.array[dtype]  # added demagnetizing factor over the volume [1/m³], shape [chunks · CHUNK]
         h: wp.array[vec3]  # field to which corrections are added [A/m], shape [n]
 
     return Couplings
@@ -81,7 +67,7 @@ def _table(start, other, tensor):
 def _kernel(dtype, group: int):
     call = "add_couplings(thread, first, last, threads, team.data, arrays)"
     arguments = {**PASS_ARGUMENTS, "arrays": couplings_type(dtype)}
-    return native_kernel(call, "cells/couplings.h", arguments, dtype=dtype, CAPACITY=CAPACITY, GROUP=group)
+    return native_kernel(call, "cells/couplings.h", arguments, dtype=dtype, GROUP=group)
 
 
 class CellCouplings:
@@ -89,10 +75,8 @@ class CellCouplings:
 
     Args:
         bodies: First moment and coupling of each body. A coupling has ``start``, ``other`` and ``tensor``, the list of
-            each cell, ``places``, ``common`` and ``hardening`` (``warpmag.shapes.demagnetization``). Bodies with the
-            same coupling object share its table.
-        worlds: Range of the inducible moments of each world, shape [worlds, 2].
-        packed: All moments, packed (``packing.PackedMoments``).
+            each cell, ``scaled_positions`` and ``common`` (``warpmag.shapes.demagnetization``). Bodies with the same
+            coupling object share its table.
         moments: Moments [A·m²], Warp array, shape [n].
         h: Field to add to [A/m], Warp array, shape [n].
         collective: True for bodies with a collective response (``induction``), which :meth:`launch_others` leaves out,
@@ -100,21 +84,16 @@ class CellCouplings:
 
     Attributes:
         rotations: Rotation from each body's frame to the world, shape [bodies]; written by the caller.
-        hardness: Added demagnetizing factor of cells over the volume [1/m³].
-        rows: First row of each body in ``hardness``, shape [bodies].
         entries: Pairs of cells per evaluation.
     """
 
-    def __init__(self, bodies, worlds, packed, moments, h, collective=None):
+    def __init__(self, bodies, moments, h, collective=None):
         """Lay out the tables on the device of the moments."""
-        dtype = packed.dtype
+        dtype = h.dtype._wp_scalar_type_
         self._couplings = c = couplings_type(dtype)()
-        c.moments, c.h, c.packed = moments, h, packed.packed
-        c.overlap, c.overlap_count = packed.overlaps, packed.overlap_counts
-        other_chunks = self._lay_out(bodies, collective, np.asarray(worlds), dtype, h.device)
+        c.moments, c.h = moments, h
+        other_chunks = self._lay_out(bodies, collective, dtype, h.device)
         self.rotations, self.entries = c.rotation, sum(len(coupling.other) for _, coupling in bodies)
-        self.hardness = c.hardness
-        self._start = self._record(c, HARDEN, HARDEN)
         self._launches, self._others = self._record_field(c), []
         if other_chunks:
             part = couplings_type(dtype)()
@@ -133,13 +112,13 @@ class CellCouplings:
         device, rows = couplings.h.device, CHUNK * couplings.chunk.shape[0]
         group = group_threads(device)
         sizes = dict(threads=threads_for(rows, _CELLS_PER_THREAD), gpu_threads=group * rows)
-        kernel = _kernel(couplings.packed.dtype, group)
+        kernel = _kernel(couplings.tensor.dtype, group)
         return launch_passes(kernel, first, last + 1, couplings, device=device, record_cmd=True, **sizes)
 
-    def _lay_out(self, bodies, collective, worlds, dtype, device) -> int:
+    def _lay_out(self, bodies, collective, dtype, device) -> int:
         """Fill the arrays; return the number of chunks of bodies without a collective response, which come first."""
         c, first_rows, tables, positions, chunks, body, other_chunks = self._couplings, {}, [], [], [], [], 0
-        self.rows = np.zeros(len(bodies), int)
+        first_row = np.zeros(len(bodies), int)
         collective = np.zeros(len(bodies), bool) if collective is None else np.asarray(collective, bool)
         for number in np.argsort(collective, kind="stable").tolist():
             first, coupling = bodies[number]
@@ -149,7 +128,7 @@ class CellCouplings:
                 scaled = coupling.scaled_positions
                 positions.append(np.pad(scaled.T, ((0, 0), (0, -len(scaled) % CHUNK))))
             count, row = len(coupling.start) - 1, CHUNK * len(chunks)
-            self.rows[number] = row
+            first_row[number] = row
             starts = range(0, count, CHUNK)
             chunks += [(first + k, min(CHUNK, count - k), row, first_rows[id(coupling)]) for k in starts]
             body += [number] * len(starts)
@@ -164,21 +143,13 @@ class CellCouplings:
         c.chunk, c.body = put(np.array(chunks, np.int32), wp.vec4i), put(np.array(body, np.int32), wp.int32)
         identity = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(bodies), 4))
         c.rotation = put(identity, wp.types.quaternion(dtype))
-        ends = self.rows + CHUNK * np.bincount(body, minlength=len(bodies))
-        c.rows = put(np.stack([self.rows, ends], axis=1).astype(np.int32), wp.vec2i)
+        ends = first_row + CHUNK * np.bincount(body, minlength=len(bodies))
+        c.rows = put(np.stack([first_row, ends], axis=1).astype(np.int32), wp.vec2i)
         c.position = put(np.concatenate(positions, axis=1), dtype)
         c.matrix = put(np.concatenate([coupling.common.ravel() for _, coupling in bodies]), dtype)
-        c.hardening = put([coupling.hardening for _, coupling in bodies], dtype)
         c.common = wp.zeros(COMMON * len(bodies), dtype=dtype, device=device)
         c.body_moments = wp.zeros((3, CHUNK * len(chunks)), dtype=dtype, device=device)
-        c.hardness = wp.zeros(CHUNK * len(chunks), dtype=dtype, device=device)
-        world = np.searchsorted(worlds[:, 0], [first for first, *_ in chunks], side="right") - 1
-        c.world = put(worlds[world].astype(np.int32), wp.vec2i)
         return other_chunks
-
-    def start(self):
-        """Launch the pass at the start of a solve, which writes ``hardness`` for the present positions."""
-        self._start.launch()
 
     def launch(self):
         """Add the corrections to the field."""

@@ -39,8 +39,8 @@ struct Cell {
     int number;
     Span at;
     Material material;
-    Number radius, scale, hardness; // scale = k/Ms
-    Number across, along;           // √(k V) D^½ perpendicular to s, and along s
+    Number radius, scale; // scale = k/Ms
+    Number across, along; // √(k V) D^½ perpendicular to s, and along s
     Vector axis, s, outside, residual, direction, field, along_direction, correction;
 };
 
@@ -67,20 +67,19 @@ CUDA_CALLABLE inline Vector sum_cells(const InducibleBody& body, const Real* tab
     return group_sums(h);
 }
 
-// Sets each cell's field to the body's own field for moments vector(cell): T m less the hardness term.
+// Sets each cell's field to the body's own field T m for moments vector(cell).
 template <class VectorOf>
 CUDA_CALLABLE inline void apply_tensors(const InducibleBody& body, Cell* cells, VectorOf vector) {
     wait_for_body();
     for_cells(body, cells, [&](Cell& cell) {
-        cell.field = vector(cell);
+        const Vector v = vector(cell);
         if (share() != 0) return;
-        put_first(body.vectors + cell.number, cell.at.count, cell.field.x);
-        put_first(body.vectors + MOST_CELLS + cell.number, cell.at.count, cell.field.y);
-        put_first(body.vectors + 2 * MOST_CELLS + cell.number, cell.at.count, cell.field.z);
+        put_first(body.vectors + cell.number, cell.at.count, v.x);
+        put_first(body.vectors + MOST_CELLS + cell.number, cell.at.count, v.y);
+        put_first(body.vectors + 2 * MOST_CELLS + cell.number, cell.at.count, v.z);
     });
     wait_for_body();
-    for_cells(body, cells,
-              [&](Cell& cell) { cell.field = sum_cells(body, body.full, cell.number) - cell.hardness * cell.field; });
+    for_cells(body, cells, [&](Cell& cell) { cell.field = sum_cells(body, body.full, cell.number); });
 }
 
 struct Pair {
@@ -170,7 +169,7 @@ CUDA_CALLABLE inline void newton_step(const InducibleBody& body, Cell* cells) {
 template <class State, class Bodies>
 CUDA_CALLABLE inline void subtract_own_field(State& state, const Bodies& bodies, int b, const InducibleBody& body,
                                              Cell* cells, int past, Real weight) {
-    const Rotation rotation = rotation_of(bodies.past.data[past * bodies.body.shape[0] + b]);
+    const Rotation<Real> rotation = rotation_of<Real>(bodies.past.data[past * bodies.body.shape[0] + b]);
     apply_tensors(body, cells, [&](const Cell& cell) {
         return moments_of(cell.material, cell.radius, to_body(rotation, get(state.past_g, cell.at, past)));
     });
@@ -181,7 +180,7 @@ CUDA_CALLABLE inline void subtract_own_field(State& state, const Bodies& bodies,
 // applied field, or is extrapolated from the last solves.
 template <class State, class Bodies>
 CUDA_CALLABLE inline void read_cells(State& state, const Bodies& bodies, int b, const InducibleBody& body, Cell* cells,
-                                     bool begin, const Rotation& rotation) {
+                                     bool begin, const Rotation<Real>& rotation) {
     const auto& row = bodies.body.data[b]; // first moment, cells, world, index of the rotation
     const bool steady = begin && state.warm.data[row[2]] == STEADY;
 #pragma unroll
@@ -195,7 +194,6 @@ CUDA_CALLABLE inline void read_cells(State& state, const Bodies& bodies, int b, 
         cell.material = material_of(state, cell.at);
         cell.radius = numbers_or(entries(state.packed, cell.at, 3), count, 0);
         cell.scale = cell.material.slope / cell.material.saturation;
-        cell.hardness = numbers_or(bodies.hardness.data + bodies.row.data[b] + offset, count, 0);
         cell.s = to_body(rotation, get(state.s, cell.at));
         cell.outside = get(begin ? state.h0 : state.h, cell.at);
         if (steady) cell.outside = 1 / cell.scale * get(state.mixed_g, cell.at);
@@ -215,7 +213,7 @@ CUDA_CALLABLE inline void respond(State& state, const Bodies& bodies, int b, boo
     const Real* const table = bodies.tensor.data + bodies.table.data[b];
     const InducibleBody body = {row[1], table, table + bodies.pair_law.data[b], vectors, parts};
     const auto now = bodies.rotation.data[row[3]];
-    const Rotation rotation = rotation_of(now);
+    const Rotation<Real> rotation = rotation_of<Real>(now);
     Cell cells[VECTORS];
     read_cells(state, bodies, b, body, cells, begin, rotation);
     auto moment = [](const Cell& cell) { return moments_of(cell.material, cell.radius, cell.s); };

@@ -49,7 +49,6 @@ class RespondingBody:
     first: int  # its first moment
     world: int  # its world
     number: int  # index of its rotation
-    row: int  # its first row in ``hardness``
     tensors: np.ndarray  # tensors between its n cells, full ones and those of the pair law [1/m³], shape [2, n, n, 6]
 
     @property
@@ -66,13 +65,10 @@ def responses_type(dtype):
     @wp.struct
     class Bodies:
         body: wp.array[wp.vec4i]  # first moment, number of cells, world, and index of the rotation, shape [b]
-        row: wp.array[int]  # first row in ``hardness``, shape [b]
         table: wp.array[int]  # begin of the shape's tensors in ``tensor``, shape [b]
         pair_law: wp.array[int]  # offset from there to the tensors of the pair law, shape [b]
         tensor: wp.array[dtype]  # the tables
-        # Arrays of all bodies with cells (``cells.couplings``).
-        hardness: wp.array[dtype]
-        rotation: wp.array[quaternion]
+        rotation: wp.array[quaternion]  # of all bodies with cells (``cells.couplings``)
         past: wp.array2d[quaternion]  # rotations at the last two solves, the last first, shape [2, b]
 
     return Bodies
@@ -105,10 +101,10 @@ class BodyResponses:
         cell_count: Cells of all bodies.
     """
 
-    def __init__(self, state, bodies: list[RespondingBody], cells):
+    def __init__(self, state, bodies: list[RespondingBody], rotations):
         """Copy the tables to the device, and mark the cells in the state of the solve.
 
-        Bodies with the same ``tensors`` object share a table. ``cells`` are their ``CellCouplings``.
+        Bodies with the same ``tensors`` object share a table. ``rotations`` are those of ``CellCouplings``.
         """
         dtype, device = state.packed.dtype, state.h.device
         self._bodies = b = responses_type(dtype)()
@@ -123,10 +119,9 @@ class BodyResponses:
             return wp.array(np.asarray(values, np.float64 if kind is dtype else np.int32), dtype=kind, device=device)
 
         b.body = put([(body.first, body.cell_count, body.world, body.number) for body in bodies], wp.vec4i)
-        b.row = put([body.row for body in bodies], wp.int32)
         b.table = put([begin[id(body.tensors)] for body in bodies], wp.int32)
         b.pair_law = put([len(_table(body.tensors[0])) for body in bodies], wp.int32)
-        b.tensor, b.hardness, b.rotation = put(np.concatenate(tables), dtype), cells.hardness, cells.rotations
+        b.tensor, b.rotation = put(np.concatenate(tables), dtype), rotations
         b.past = wp.zeros((2, len(bodies)), dtype=wp.types.quaternion(dtype), device=device)
         self.cell_count = sum(body.cell_count for body in bodies)
         responding = np.concatenate([body.first + np.arange(body.cell_count) for body in bodies])

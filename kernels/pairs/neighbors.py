@@ -15,6 +15,7 @@ counting sort on a CPU makes the candidates of a target contiguous.
 import math
 from functools import cache
 
+import numpy as np
 import warp as wp
 
 from warpmag.kernels.shared.native import native_kernel
@@ -40,6 +41,7 @@ def lists_type(dtype):
     class NeighborLists:
         # Model:
         group: wp.array[int]  # only moments of one group are neighbors; none if negative, shape [n] or longer
+        body: wp.array[int]  # moments of one body are not neighbors, shape [n]
         ratio: wp.float64  # distance of neighbors over their contact distance, at most
         reach: wp.array[wp.float64]  # largest contact distance [m], shape [1]
         # Data in:
@@ -59,21 +61,22 @@ def lists_type(dtype):
         before: wp.array[int]  # previous moment of the same bucket, or -1, shape [n]
         # Buffers of a CPU, in the order of buckets:
         bucket: wp.array[int]  # first entry of each bucket, shape [2ᵏ + 1]
-        entries: wp.array2d[int]  # index, cell's x and y, group; and the bucket of each moment, shape [5, n padded]
+        entries: wp.array2d[int]  # index, body, cell's x and y, group; and each moment's bucket, shape [6, n padded]
         balls: wp.array2d[dtype]  # positions and radii [m], shape [4, n padded]
 
     return NeighborLists
 
 
-def allocate(count: int, packed, group, *, reach: float, ratio=1.0 + SKIN, capacity=CAPACITY):
+def allocate(count: int, packed, group, *, reach: float, ratio=1.0 + SKIN, capacity=CAPACITY, bodies=None):
     """Allocate empty lists of ``count`` moments; return the struct :func:`lists_type`, which describes the arguments.
 
-    A ``ratio`` of 1 lists overlapping pairs only.
+    A ``ratio`` of 1 lists overlapping pairs only. Without ``bodies`` each moment is a body.
     """
     device, dtype = packed.device, packed.dtype
     linked, padded = (0, count + _PADDING) if device.is_cpu else (count, 0)
     lists = lists_type(dtype)()
     lists.packed, lists.group, lists.ratio = packed, group, ratio
+    lists.body = wp.array(np.arange(count) if bodies is None else bodies, dtype=wp.int32, device=device)
     lists.reach = wp.full(1, reach, dtype=wp.float64, device=device)
     lists.neighbor = (wp.zeros if ratio > 1.0 else wp.empty)((count, capacity), dtype=int, device=device)
     lists.count = wp.zeros(count, dtype=int, device=device)
@@ -88,7 +91,7 @@ def allocate(count: int, packed, group, *, reach: float, ratio=1.0 + SKIN, capac
     lists.table = wp.zeros(0 if device.is_cpu else buckets, dtype=wp.uint64, device=device)
     lists.cell = wp.zeros(linked, dtype=wp.vec4i, device=device)
     lists.before = wp.zeros(linked, dtype=int, device=device)
-    lists.entries = wp.zeros((5, padded), dtype=int, device=device)
+    lists.entries = wp.zeros((6, padded), dtype=int, device=device)
     lists.balls = wp.zeros((4, padded), dtype=dtype, device=device)
     return lists
 

@@ -11,12 +11,12 @@ namespace warpmag {
 
 constexpr int TARGETS = 64; // targets that a thread takes at a time
 
-// Sources in the order of their buckets: index, column, group, position and radius. ``begin[b]`` is the first source of
+// Sources in the order of their buckets: index, body, column, group, position and radius. ``begin[b]`` is the first source of
 // bucket b. ``bucket`` has the bucket of each source, or −1, in the original order of sources.
 struct SortedSources {
     int buckets, pitch, *begin, *index;
     Real* x;
-    int *column_x = index + pitch, *column_y = column_x + pitch, *group = column_y + pitch, *bucket = group + pitch;
+    int *body = index + pitch, *column_x = body + pitch, *column_y = column_x + pitch, *group = column_y + pitch, *bucket = group + pitch;
     Real *y = x + pitch, *z = y + pitch, *radius = z + pitch;
 };
 
@@ -36,7 +36,7 @@ template <class Lists> inline SortedSources sort_sources(const Lists& sources, d
         if (s.bucket[j] < 0) continue;
         const Cell cell = cell_of(balls, j, sources.group.data[j], cells_per_meter);
         const int e = --s.begin[s.bucket[j]];
-        s.index[e] = j;
+        s.index[e] = j, s.body[e] = sources.body.data[j];
         s.column_x[e] = cell.x, s.column_y[e] = cell.y, s.group[e] = cell.group;
         s.x[e] = balls.x[j], s.y[e] = balls.y[j], s.z[e] = balls.z[j], s.radius[e] = balls.radius[j];
     }
@@ -45,7 +45,7 @@ template <class Lists> inline SortedSources sort_sources(const Lists& sources, d
 
 struct Target {
     Real x, y, z, radius, ratio;
-    int self; // index among the sources, −1 if the target is not a source
+    int body; // body whose sources are not neighbors, −1 for none
 };
 
 // Appends the sources ``begin`` to ``end`` of a column that are near a target to a list, which keeps the first
@@ -56,7 +56,7 @@ inline int find_in_run(const SortedSources& s, const Target& t, Cell column, int
         const Number reach = t.ratio * (t.radius + numbers(s.radius + e));
         const Index j = indices(s.index + e);
         const auto near = __builtin_convertvector(dot(r, r) < reach * reach, Index) & (lanes() < end - e)
-                          & (j != t.self) & (indices(s.column_x + e) == column.x)
+                          & (indices(s.body + e) != t.body) & (indices(s.column_x + e) == column.x)
                           & (indices(s.column_y + e) == column.y) & (indices(s.group + e) == column.group);
         count += append(list + (count < CAPACITY ? count : CAPACITY), j, near);
     }
@@ -101,7 +101,8 @@ inline void search_neighbors(const Lists& targets, const Lists& sources, int thr
     const bool same = targets.count.data == sources.count.data;
     share_items(team, threads, targets.packed.shape[1], TARGETS, [&](int i) {
         int list[CAPACITY + WIDTH];
-        const Target target = {balls.x[i], balls.y[i], balls.z[i], balls.radius[i], (Real)targets.ratio, same ? i : -1};
+        const Target target = {balls.x[i], balls.y[i], balls.z[i], balls.radius[i], (Real)targets.ratio,
+                               same ? targets.body.data[i] : -1};
         const int count = find_around(sorted, target, cell_of(balls, i, targets.group.data[i], cells_per_meter), list);
         write_sorted(list, count < CAPACITY ? count : CAPACITY, targets.neighbor.data + (size_t)CAPACITY * i);
         targets.count.data[i] = count;

@@ -42,6 +42,7 @@ template <class Lists> __device__ inline void list_neighbors(int thread, const L
     if (c == 0) neighbors = 0;
     __syncwarp();
     const bool same = targets.count.data == sources.count.data;
+    const int own_body = same ? targets.body.data[i] : -1;
     const Balls own = balls_of(targets), others = balls_of(sources);
     const Real x = own.x[i], y = own.y[i], z = own.z[i], radius = own.radius[i], ratio = (Real)targets.ratio;
     Cell near_cell = same ? cells_of(sources)[i] : cell_of(own, i, targets.group.data[i], cells_per_meter_of(targets));
@@ -53,10 +54,9 @@ template <class Lists> __device__ inline void list_neighbors(int thread, const L
             if (cell.x != near_cell.x || cell.y != near_cell.y || cell.z != near_cell.z
                 || cell.group != near_cell.group)
                 continue;
-            if (same && i == j) continue;
             const Vector r = {x - others.x[j], y - others.y[j], z - others.z[j]};
             const Real reach = ratio * (radius + others.radius[j]);
-            if (!(dot(r, r) < reach * reach)) continue;
+            if (!(dot(r, r) < reach * reach) || (same && sources.body.data[j] == own_body)) continue;
             const int slot = atomicAdd(&neighbors, 1);
             if (slot < CAPACITY) list[slot] = j;
         }

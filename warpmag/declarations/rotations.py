@@ -30,3 +30,14 @@ def cross(a, b) -> np.ndarray:
 def dot(a, b) -> np.ndarray:
     """Return dot products of rows, shape [n, 1]."""
     return np.einsum("ni,ni->n", a, b)[:, None]
+
+
+def quaternion_of(matrix) -> np.ndarray:
+    """Return the quaternion (x, y, z, w) of a rotation matrix, shape [4]: an eigenvector (Bar-Itzhack 2000)."""
+    m = np.asarray(matrix, float)
+    axis = np.array([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
+    symmetric = np.zeros((4, 4))
+    symmetric[:3, :3] = m + m.T - np.trace(m) * np.eye(3)
+    symmetric[3, :3] = symmetric[:3, 3] = axis
+    symmetric[3, 3] = np.trace(m)
+    return np.linalg.eigh(symmetric)[1][:, -1]

@@ -12,6 +12,7 @@ from warpmag.errors import InputError
 from warpmag.kernels.applied.fields import AppliedForces
 from warpmag.kernels.applied.solids import SolidMagnet
 from warpmag.kernels.applied.sources import AppliedSource, FieldSources
+from warpmag.kernels.cells.cell_pairs import CellPairs
 from warpmag.kernels.cells.couplings import CellCouplings
 from warpmag.kernels.eddy.eddy import EddyCurrents
 from warpmag.kernels.fmm.evaluation import sampled_error
@@ -224,21 +225,32 @@ class MomentSystem:
 
     def _make_cells(self, layout: MomentLayout, couplings, responses: bool):
         """Prepare the corrections between cells; ``responses`` is True if small bodies respond collectively."""
-        worlds = [(first, middle) for first, middle, _ in layout.ranges()]
-        self._cells = self.rotations = None
+        self._cells = self._cell_pairs = self.rotations = None
         if couplings:
             collective = [responses and len(coupling.radii) <= MOST_CELLS for _, coupling in couplings]
-            self._cells = CellCouplings(couplings, worlds, self._packed, self.moments, self.h, collective)
+            several = np.bincount(layout.worlds[[first for first, _ in couplings]]).max() > 1
+            if several:
+                # common fields describe charges at the edges of a lone body: touching cubes would pull 9 % too much
+                couplings = [
+                    (first, coupling if len(coupling.radii) <= MOST_CELLS else coupling.without_common_fields)
+                    for first, coupling in couplings
+                ]
+            self._cells = CellCouplings(couplings, self.moments, self.h, collective)
             self.rotations = self._cells.rotations
+            if several:
+                self._cell_pairs = CellPairs(
+                    couplings, self.rotations, layout.worlds, layout.movable, self._packed, self.moments, self.h,
+                    self.forces, self.torques,
+                )  # fmt: skip
 
     def _make_responses(self, layout: MomentLayout, couplings) -> BodyResponses | None:
         """Prepare the collective response of bodies of few cells."""
         bodies = [
-            RespondingBody(first, int(layout.worlds[first]), number, int(self._cells.rows[number]), coupling.dense)
+            RespondingBody(first, int(layout.worlds[first]), number, coupling.dense)
             for number, (first, coupling) in enumerate(couplings)
             if len(coupling.radii) <= MOST_CELLS
         ]
-        return BodyResponses(self._induction, bodies, self._cells) if bodies else None
+        return BodyResponses(self._induction, bodies, self.rotations) if bodies else None
 
     def _make_wrench(self, layout: MomentLayout, rotatable):
         """Prepare forces on movable moments for each force law, and torques of the moments that ``rotatable`` marks."""
@@ -328,6 +340,8 @@ class MomentSystem:
         parts["dynamics"] = self.dynamics.persistent_arrays()
         if self._near is not None:
             parts["near"] = self._near.persistent_arrays()
+        if self._cell_pairs is not None:
+            parts["cell_pairs"] = self._cell_pairs.persistent_arrays()
         inner = {f"{part}.{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
         material = {"saturation": self.material.saturation, "slope": self.material.slope}
         return {"moments": self.moments, **material, **inner}
@@ -359,8 +373,8 @@ class MomentSystem:
             launch_add_bias(self.bias, self._biased, self._induction.h0)
         if self._inducible_field.count == 0:
             return
-        if self._cells is not None:
-            self._cells.start()
+        if self._cell_pairs is not None:
+            self._cell_pairs.find()
         self.dynamics.start()
         if self._near is not None:
             near_pairs.wait(self._near)
@@ -371,6 +385,7 @@ class MomentSystem:
         self._sum_field()
         if self._cells is not None:
             self._cells.launch_others()
+        self._add_cell_pairs()
         self.dynamics.iterate()
         self._wait_for_near_contacts()
 
@@ -390,7 +405,13 @@ class MomentSystem:
         self._sum_field()
         if self._cells is not None:
             self._cells.launch()
+        self._add_cell_pairs()
         self._wait_for_near_contacts()
+
+    def _add_cell_pairs(self):
+        """Launch the corrections of the field between cells of different bodies."""
+        if self._cell_pairs is not None:
+            self._cell_pairs.add_field()
 
     def _sum_field(self):
         """Launch the sums of the field at the inducible moments; :meth:`_wait_for_near_contacts` must follow."""
@@ -467,6 +488,8 @@ class MomentSystem:
             near_pairs.launch_begin_forces(near)
         for evaluation in self._wrench[force]:
             evaluation.launch()
+        if self._cell_pairs is not None:
+            self._cell_pairs.add_forces()
         expanded = interaction is not None and interaction.expansion is not None
         if expanded:
             interaction.expand()

@@ -15,30 +15,36 @@ correction: for cells nearer than :data:`EXACT_REACH`, the exact tensor minus th
 itself, the 1/3 that the magnetization curve of a ball contains is subtracted instead.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from warpmag.declarations.rotations import quaternion_of
 from warpmag.shapes.ball_pairs import radial_factors
 from warpmag.shapes.lattice import Lattice, Pieces
 from warpmag.shapes.solids import grid
 
-EXACT_REACH = 3.0
-"""Distance up to which pairs of cells are corrected, in longest sides of a cell (see ``tests/test_cells.py``)."""
+EXACT_REACH = 3.0, 6.0
+"""Smallest and largest distance up to which pairs of cells are corrected, in longest sides of a cell."""
+
+_NEAR_CELLS = 114
+"""Number of cells within the smallest reach in a block of cubes. Rods and sheets have fewer there, so their reach grows
+until it holds as many cells. With dipoles from 3 sides on, the operator of rods of 1:40 is negative; with dipoles from
+6 sides on, its error is 1e-4 to 1e-5."""
+
 _SUBCELLS = 8
-"""Largest number of subcells along each axis of a cell that the surface cuts, for cells that touch."""
-_DISTANT_SUBCELLS = 4
-"""Largest number of subcells along each axis, for cells that do not touch."""
+"""Largest number of subcells along each axis of a cell that the surface cuts. Coarser subcells for pairs that do not
+touch give rods of 1:20 negative eigenvalues."""
+
 _FAR_REACH = 4.0
-"""Distance up to which quadrupoles of cells are corrected, in :data:`EXACT_REACH`."""
+"""Distance up to which quadrupoles of cells are corrected, in reaches of the exact tensors."""
+
 _LARGEST_SPREAD = 0.15
 """Bound on the norm of the traceless second moments of a moment's volume, in squares of a cell's longest side. Two
 joined cubic cells have 0.2."""
 COMPONENTS = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
 """Rows and columns of the six components of a symmetric tensor: xx, yy, zz, xy, xz, yz."""
-_LANCZOS_STEPS = 20
-"""Largest number of Lanczos steps; the largest eigenvalue then has an error of 3 %."""
 _BATCH = 1 << 22
 """Largest number of entries of a temporary array (tens of MB)."""
 
@@ -56,6 +62,8 @@ class Coupling:
     common: np.ndarray  # matrix C [1/m³], shape [8, 8]
     positions: np.ndarray  # positions of the moments [m], shape [n, 3]
     radii: np.ndarray  # radii of the moments' balls [m], shape [n]
+    half_sides: np.ndarray  # boxes with the volumes and second moments of the cells, frame of the grid [m], [n, 3]
+    grid_rotation: np.ndarray  # from the frame of the grid to that of the body (x, y, z, w), shape [4]
 
     @cached_property
     def center(self) -> np.ndarray:
@@ -73,32 +81,9 @@ class Coupling:
         return (self.positions - self.center) / self.extent
 
     @cached_property
-    def hardening(self) -> float:
-        """Largest eigenvalue of √V_i T_ij √V_j with the common fields [dimensionless], by Lanczos iteration.
-
-        It is the largest reduction of a demagnetizing factor by the correction. Cells that overlap other bodies get it
-        as an additional demagnetizing factor (``kernels.cells.couplings``). All Lanczos vectors are orthogonalized.
-        """
-        root = np.sqrt(4.0 / 3.0 * np.pi * self.radii**3)[:, None]
-        near, common = full_tensors(self.tensor), common_fields(self.scaled_positions)
-
-        def apply(m):
-            m = root * m.reshape(-1, 3)
-            sums = np.add.reduceat((near @ m[self.other, :, None])[..., 0], self.start[:-1], axis=0)
-            return (root * (sums + common @ (self.common @ np.einsum("nkl,nk->l", common, m)))).ravel()
-
-        basis = np.random.default_rng(0).normal(size=(1, 3 * len(root)))
-        basis /= np.linalg.norm(basis)
-        images = np.empty((0, basis.shape[1]))
-        while len(images) < min(_LANCZOS_STEPS, basis.shape[1]):
-            images = np.append(images, [apply(basis[-1])], axis=0)
-            residual = images[-1] - (basis @ images[-1]) @ basis
-            residual -= (basis @ residual) @ basis
-            size = np.linalg.norm(residual)
-            if size < 1e-9 * np.linalg.norm(images[0]):
-                break
-            basis = np.append(basis, [residual / size], axis=0)
-        return max(0.0, float(np.linalg.eigvalsh(basis[: len(images)] @ images.T)[-1]))
+    def without_common_fields(self) -> "Coupling":
+        """The coupling without the correction of the common fields, one object for all bodies of the shape."""
+        return replace(self, common=np.zeros_like(self.common))
 
     @cached_property
     def dense(self) -> np.ndarray:
@@ -170,22 +155,33 @@ def _quotient(a, b):
     return np.where(b != 0.0, a / np.where(b != 0.0, b, 1.0), 0.0)
 
 
-def coupling(lattice: Lattice, radii: np.ndarray, reach: float = EXACT_REACH) -> Coupling:
-    """Return the correction of the pair sums between the moments of one body, up to ``reach`` longest sides of a cell.
+def coupling(lattice: Lattice, radii: np.ndarray) -> Coupling:
+    """Return the correction of the pair sums between near moments of one body.
 
     ``radii`` are the radii of the balls in the pair sums [m], shape [n]. Cells of different grids are not corrected.
     """
     x, volumes = lattice.positions, lattice.volumes
     entries, tensors = [np.empty((2, 0), int)], [np.empty((0, 6))]
     for part in lattice.pieces:
-        (i, j), exact = _part_tensors(part, lattice, reach)
+        (i, j), exact = _part_tensors(part, lattice)
         entries.append(np.stack([i, j]))
         exact = -exact / np.sqrt(volumes[i] * volumes[j])[:, None]
         tensors.append(exact - _pair_law(x[i] - x[j], radii[i], radii[j], i == j))
     (i, j), tensor = np.concatenate(entries, axis=1), np.concatenate(tensors)
     order = np.lexsort((j, i))
     start = np.searchsorted(i[order], np.arange(len(volumes) + 1))
-    return Coupling(start, j[order], tensor[order], np.zeros((8, 8)), x, radii)
+    boxes, grid_rotation = _boxes(lattice)
+    return Coupling(start, j[order], tensor[order], np.zeros((8, 8)), x, radii, boxes, grid_rotation)
+
+
+def _boxes(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
+    """Return the half sides of the cells' boxes [m], shape [n, 3], and the rotation of their grid (x, y, z, w)."""
+    (part,) = lattice.pieces  # the shapes of an inducible body share a grid
+    volumes = np.bincount(part.moment, part.share * part.filled.mean(axis=(1, 2, 3))[part.piece])
+    squares = np.einsum("nkk->nk", _spreads(part, 0, volumes))
+    half = np.sqrt(3.0 * squares)
+    half *= np.cbrt(lattice.volumes / (8.0 * half.prod(axis=1)))[:, None]
+    return half, quaternion_of(part.rotation)
 
 
 def _pair_law(r, a, b, same):
@@ -196,11 +192,11 @@ def _pair_law(r, a, b, same):
     return (g1[:, None] * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]) + g2[:, None] * products) / (4.0 * np.pi)
 
 
-def _part_tensors(part: Pieces, lattice: Lattice, reach: float) -> tuple[np.ndarray, np.ndarray]:
+def _part_tensors(part: Pieces, lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
     """Return near moments of a grid, shape [2, pairs], and N_ij √(V_i V_j) over a cell's volume, shape [pairs, 6]."""
     first, count = int(part.moment.min()), len(np.unique(part.moment))
     local = (lattice.positions[first : first + count] - part.position) @ part.rotation
-    reach = reach * float(part.sides.max())
+    reach = _reach(local, float(part.sides.max()))
     i, j = _near_pairs(local, reach)
     volume = np.bincount(part.moment - first, part.share * part.filled.mean(axis=(1, 2, 3))[part.piece], count)
     order = np.argsort(part.moment, kind="stable")
@@ -226,7 +222,15 @@ def _part_tensors(part: Pieces, lattice: Lattice, reach: float) -> tuple[np.ndar
 
 
 def _second_moments(part: Pieces, first: int, volume: np.ndarray) -> np.ndarray:
-    """Return the traceless second moments of each moment's volume about its centroid, per volume, shape [n, 3, 3]."""
+    """Return the traceless part of :func:`_spreads`, at most ``_LARGEST_SPREAD``, shape [n, 3, 3]."""
+    spread = _spreads(part, first, volume)
+    spread -= np.trace(spread, axis1=1, axis2=2)[:, None, None] * np.eye(3) / 3.0
+    size, most = np.linalg.norm(spread, axis=(1, 2)), _LARGEST_SPREAD * part.sides.max() ** 2
+    return spread * np.minimum(1.0, most / np.maximum(size, np.finfo(float).tiny))[:, None, None]
+
+
+def _spreads(part: Pieces, first: int, volume: np.ndarray) -> np.ndarray:
+    """Return the second moments of each moment's volume about its centroid, per volume, shape [n, 3, 3]."""
     split = np.array(part.filled.shape[1:])
     points, weights = (grid(split) + 0.5) / split * part.sides, part.filled.reshape(len(part.filled), -1) / split.prod()
     corner, zeroth = part.index * part.sides, weights.sum(axis=1)[:, None]
@@ -240,10 +244,7 @@ def _second_moments(part: Pieces, first: int, volume: np.ndarray) -> np.ndarray:
     sums = np.concatenate([first_moments, second_moments.reshape(-1, 9)], axis=1)[part.piece] * part.share[:, None]
     sums = np.stack([np.bincount(part.moment - first, x, len(volume)) for x in sums.T], axis=1) / volume[:, None]
     center = sums[:, :3]
-    spread = sums[:, 3:].reshape(-1, 3, 3) - center[:, :, None] * center[:, None]
-    spread -= np.trace(spread, axis1=1, axis2=2)[:, None, None] * np.eye(3) / 3.0
-    size, most = np.linalg.norm(spread, axis=(1, 2)), _LARGEST_SPREAD * part.sides.max() ** 2
-    return spread * np.minimum(1.0, most / np.maximum(size, np.finfo(float).tiny))[:, None, None]
+    return sums[:, 3:].reshape(-1, 3, 3) - center[:, :, None] * center[:, None]
 
 
 def _far_corrections(points: np.ndarray, volumes: np.ndarray, spreads: np.ndarray, reach: float) -> np.ndarray:
@@ -280,6 +281,15 @@ def _far_corrections(points: np.ndarray, volumes: np.ndarray, spreads: np.ndarra
     return positive[:, *COMPONENTS]
 
 
+def _reach(points: np.ndarray, side: float) -> float:
+    """Return the distance [m] up to which moments of cells with a longest ``side`` [m] are corrected."""
+    least, most = (side * sides for sides in EXACT_REACH)
+    i, j = _near_pairs(points, most)
+    distances = np.sort(np.linalg.norm(points[i] - points[j], axis=1))  # each moment itself, and each pair once
+    needed = len(points) * (_NEAR_CELLS + 1) // 2
+    return float(np.clip(distances[needed], least, most)) if needed < len(distances) else most
+
+
 def _near_pairs(points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the pairs i ≤ j of points at most ``reach`` apart."""
     pairs = []
@@ -296,17 +306,14 @@ def _piece_tensors(part: Pieces, p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return ∫∫ of the demagnetizing kernel over pairs of pieces, divided by a cell's volume, shape [pairs, 6]."""
     separation = part.index[p] - part.index[q]
     full = part.filled.min(axis=(1, 2, 3)) == 1.0
-    both_full, touching = full[p] & full[q], (np.abs(separation) <= 1).all(axis=1)
-    near, far = np.flatnonzero(~both_full & touching), np.flatnonzero(~both_full & ~touching)
+    both_full = full[p] & full[q]
+    cut = np.flatnonzero(~both_full)
     result = np.empty((len(p), 6))
     offsets, inverse = np.unique(separation[both_full], axis=0, return_inverse=True)
     result[both_full] = cuboid_tensors(offsets, part.sides)[inverse.reshape(-1)]
-    if len(near):
+    if len(cut):
         filled = _binary(_coarsened(part.filled, _SUBCELLS))
-        result[near] = _cut_tensors(part.sides, filled, p[near], q[near], separation[near])
-    if len(far):
-        filled = _coarsened(part.filled, _DISTANT_SUBCELLS)
-        result[far] = _cut_tensors(part.sides, filled, p[far], q[far], separation[far])
+        result[cut] = _cut_tensors(part.sides, filled, p[cut], q[cut], separation[cut])
     return result
 
 

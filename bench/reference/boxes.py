@@ -1,0 +1,75 @@
+"""Uniformly magnetized boxes that act on each other, in float64: what ``kernels/cells/cell_pairs.h`` computes.
+
+The windows and the number of Gauss points are those of ``warpmag.kernels.cells.cell_pairs``; all formulas are derived
+again.
+"""
+
+import itertools
+
+import numpy as np
+
+from bench.reference import oracle
+
+
+def field_tensor(r: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Tensor K of the field H = K M of a box, shape [n, 3, 3].
+
+    Args:
+        r: Points from the center, in the frame of the box [m], shape [n, 3].
+        half: Half sides [m], shape [3].
+    """
+    tensor = np.zeros((len(r), 3, 3))
+    for signs in itertools.product((-1.0, 1.0), repeat=3):
+        corner, sign = r - np.array(signs) * half, np.prod(signs)
+        distance = np.linalg.norm(corner, axis=1)
+        for k in range(3):
+            a, b = corner[:, (k + 1) % 3], corner[:, (k + 2) % 3]
+            tensor[:, k, k] += sign * np.arctan(a * b / (corner[:, k] * distance))
+            across = -sign * np.arcsinh(corner[:, k] / np.hypot(a, b))
+            tensor[:, (k + 1) % 3, (k + 2) % 3] += across
+            tensor[:, (k + 2) % 3, (k + 1) % 3] += across
+    return tensor / (4.0 * np.pi)
+
+
+def mean_tensor(r, rotation, half, other_half, points: int) -> np.ndarray:
+    """Field tensor of a box over its volume, averaged over Gauss points of another one [1/m³], shape [3, 3].
+
+    ``r`` is the position of the other box and ``rotation`` its rotation, both in the frame of the box.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(points)
+    places = np.array(list(itertools.product(nodes, repeat=3))) * other_half
+    weight = np.array([np.prod(w) for w in itertools.product(0.5 * weights, repeat=3)])
+    tensors = field_tensor(r + places @ rotation.T, half)
+    return np.einsum("n,nkl->kl", weight, tensors) / (8.0 * np.prod(half))
+
+
+def fade(distance: float, window: tuple[float, float]) -> float:
+    """Smooth step from 1 to 0."""
+    t = np.clip((window[1] - distance) / (window[1] - window[0]), 0.0, 1.0)
+    return float(t * t * (3.0 - 2.0 * t))
+
+
+def pair_correction(a, b, window, close, points: int) -> np.ndarray:
+    """Tensor of a pair of boxes less that of balls of their volumes [1/m³], shape [3, 3].
+
+    Args:
+        a, b: Boxes: position [m], rotation matrix, half sides [m].
+        window, close: Windows of all boxes and of boxes integrated over, in mean sizes.
+        points: Gauss points of close boxes along each axis.
+    """
+    (x, turn, half), (y, other_turn, other_half) = a, b
+    r, d = x - y, np.linalg.norm(x - y)
+    sizes = [2.0 * h.max() ** 1.5 / np.sqrt(h.min()) for h in (half, other_half)]
+    radii = [np.cbrt(8.0 * h.prod() * 0.75 / np.pi) for h in (half, other_half)]
+    distance = d / np.mean(sizes)
+
+    def both(count):
+        of_b = mean_tensor(other_turn.T @ r, other_turn.T @ turn, other_half, half, count)
+        of_a = mean_tensor(-turn.T @ r, turn.T @ other_turn, half, other_half, count)
+        return other_turn @ of_b @ other_turn.T + turn @ of_a @ turn.T
+
+    g1, g2, _ = oracle.radial_factors(np.array([d]), radii[0], radii[1])
+    ball = (g1[0] * np.eye(3) + g2[0] * np.outer(r, r)) / (4.0 * np.pi)
+    near = fade(distance, close)
+    tensor = near * (0.5 * both(points) - ball) + (1.0 - near) * (both(1) - 2.0 * ball)
+    return fade(distance, window) * tensor

@@ -1,0 +1,124 @@
+// Field of a uniformly magnetized box, in closed form, and its derivatives, in the frame of the box.
+//
+// The field at r from the center is H = K(r) M. With corners at signs s of the half sides h, x = r_x − s_x h_x, and so
+// on, R = √(x² + y² + z²) and s = s_x s_y s_z,
+//
+//     4π K_xx = Σ s arctan(yz/(xR)),    4π K_xy = −Σ s ln(z + R),    trace K = −1 inside, 0 outside.
+//
+// Derivatives of the logarithms are algebraic, and the other ones follow from div H = 0.
+//
+// Reference: Joseph and Schlömann 1965, "Demagnetizing field in nonellipsoidal bodies", J. Appl. Phys. 36, 1579-1593.
+#pragma once
+#include "shared/vectors.h"
+
+namespace warpmag {
+
+constexpr Real INVERSE_4_PI = Real(0.07957747154594767);
+
+// Corners of a box relative to points: x[0] is the distance from the lower face, x[1] from the upper face, and
+// distance[k] that of the corner whose bits select upper faces: 1 of x, 2 of y, 4 of z.
+struct BoxView {
+    Number x[2], y[2], z[2], distance[8];
+    Vector half;
+};
+CUDA_CALLABLE inline BoxView view_box(Vector r, Vector half) {
+    BoxView v = {{r.x + half.x, r.x - half.x}, {r.y + half.y, r.y - half.y}, {r.z + half.z, r.z - half.z}, {}, half};
+    for (int k = 0; k < 8; ++k) {
+        const Number x = v.x[k & 1], y = v.y[k >> 1 & 1], z = v.z[k >> 2];
+        v.distance[k] = root(x * x + y * y + z * z);
+    }
+    return v;
+}
+
+// Σ s ln(w + R) over the corners, less a constant, for edges of half length ``half`` along an axis w. ``along``, ``a``
+// and ``b`` are the bits of w and of the other two axes.
+CUDA_CALLABLE inline Number edge_logarithms(const BoxView& v, Number half, int along, int a, int b) {
+    const Number tiny = half * Real(1e-7);
+    Number upper = half * Real(0) + 1, lower = upper;
+    for (int k = 0; k < 4; ++k) {
+        const int corner = (k & 1 ? a : 0) + (k & 2 ? b : 0);
+        const Number sum = v.distance[corner] + v.distance[corner + along];
+        const Number near = larger(sum - 2 * half, tiny), far = sum + 2 * half;
+        const bool positive = k == 0 || k == 3;
+        upper *= positive ? near : far;
+        lower *= positive ? far : near;
+    }
+    return logarithm(upper / lower);
+}
+
+// Solid angle of the two faces across an axis, Σ s arctan(yz/(xR)): x, y and z are any axes, with their bits.
+CUDA_CALLABLE inline Number face_angles(const BoxView& v, const Number* x, const Number* y, const Number* z, int of_x,
+                                        int of_y, int of_z) {
+    Number sum = x[0] * Real(0);
+    const Number zero = sum;
+    for (int side = 0; side < 2; ++side) {
+        const Number height = larger(x[side], -x[side]);
+        Number solid = zero;
+        for (int end = 0; end < 2; ++end) {
+            const int corner = (side ? of_x : 0) + (end ? of_z : 0);
+            const Number near = v.distance[corner], far = v.distance[corner + of_y];
+            const Number real = height * height * near * far + y[0] * y[1] * z[end] * z[end];
+            const Number imaginary = height * z[end] * (y[0] * far - y[1] * near);
+            const Number part = angle(imaginary, real);
+            solid += end ? -part : part;
+        }
+        const Number outward = x[side] < zero ? -solid : solid;
+        sum += side ? outward : -outward;
+    }
+    return sum;
+}
+
+// K of the box.
+CUDA_CALLABLE inline Symmetric box_tensor(const BoxView& v) {
+    const Number zero = v.half.x * Real(0);
+    const Number xx = INVERSE_4_PI * face_angles(v, v.x, v.y, v.z, 1, 2, 4);
+    const Number yy = INVERSE_4_PI * face_angles(v, v.y, v.z, v.x, 2, 4, 1);
+    const auto inside =
+        (v.x[0] > zero) & (v.x[1] < zero) & (v.y[0] > zero) & (v.y[1] < zero) & (v.z[0] > zero) & (v.z[1] < zero);
+    const Number zz = (inside ? zero - 1 : zero) - xx - yy;
+    return {xx,
+            yy,
+            zz,
+            -INVERSE_4_PI * edge_logarithms(v, v.half.z, 4, 1, 2),
+            -INVERSE_4_PI * edge_logarithms(v, v.half.x, 1, 2, 4),
+            -INVERSE_4_PI * edge_logarithms(v, v.half.y, 2, 1, 4)};
+}
+
+// Sums over the corners for the edges along an axis w: Σ s a/(R (R + w)) and Σ s b/(R (R + w)) for the other two axes,
+// and Σ s/R.
+struct EdgeSlopes {
+    Number a, b, along;
+};
+CUDA_CALLABLE inline EdgeSlopes edge_slopes(const BoxView& v, const Number* w, const Number* a, const Number* b,
+                                            int of_w, int of_a, int of_b, Number tiny) {
+    EdgeSlopes sums = {tiny * Real(0), tiny * Real(0), tiny * Real(0)};
+    for (int k = 0; k < 4; ++k) {
+        const int corner = (k & 1 ? of_a : 0) + (k & 2 ? of_b : 0);
+        const Number inverse_lower = 1 / larger(v.distance[corner], tiny),
+                     inverse_upper = 1 / larger(v.distance[corner + of_w], tiny);
+        const Number p = a[k & 1], q = b[k >> 1], across = larger(p * p + q * q, tiny * tiny);
+        const Real sign = k == 0 || k == 3 ? Real(1) : Real(-1);
+        const Number cosines = sign * (w[0] * inverse_lower - w[1] * inverse_upper) / across;
+        sums.a += p * cosines;
+        sums.b += q * cosines;
+        sums.along += sign * (inverse_upper - inverse_lower);
+    }
+    return sums;
+}
+
+// Symmetric product of two vectors in the derivatives of K: (e·∇) K m.
+CUDA_CALLABLE inline Vector box_slope(const BoxView& v, Vector m, Vector e) {
+    const Number tiny = Real(1e-4) * smaller(v.half.x, smaller(v.half.y, v.half.z));
+    const EdgeSlopes z = edge_slopes(v, v.z, v.x, v.y, 4, 1, 2, tiny), y = edge_slopes(v, v.y, v.x, v.z, 2, 1, 4, tiny),
+                     x = edge_slopes(v, v.x, v.y, v.z, 1, 2, 4, tiny);
+    // third derivatives, over −1/4π
+    const Number xxy = z.a, xyy = z.b, xyz = z.along, xxz = y.a, xzz = y.b, yyz = x.a, yzz = x.b;
+    const Number xxx = -xyy - xzz, yyy = -xxy - yzz, zzz = -xxz - yyz;
+    const Number pxx = m.x * e.x, pyy = m.y * e.y, pzz = m.z * e.z;
+    const Number pxy = m.x * e.y + m.y * e.x, pyz = m.y * e.z + m.z * e.y, pzx = m.z * e.x + m.x * e.z;
+    return -INVERSE_4_PI
+           * Vector{xxx * pxx + xyy * pyy + xzz * pzz + xxy * pxy + xyz * pyz + xxz * pzx,
+                    xxy * pxx + yyy * pyy + yzz * pzz + xyy * pxy + yyz * pyz + xyz * pzx,
+                    xxz * pxx + yyz * pyy + zzz * pzz + xyz * pxy + yzz * pyz + xzz * pzx};
+}
+}
