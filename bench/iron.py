@@ -15,6 +15,7 @@ import warp as wp
 import warpmag
 from bench.machine import line_writer
 from bench.reference.iron_bodies import SETUPS, Body, Setup, load
+from warpmag.declarations.magnets import CONTACT_MODELS
 
 _UNSATURATED = 1e9  # saturation magnetization of iron with a linear curve [A/m]
 _SETTLED = 1e-5  # tolerance of the solve, far below the errors of interest
@@ -26,21 +27,23 @@ def main() -> None:
     parser.add_argument("names", nargs="*", default=[""], help="beginnings of names of setups; all without")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--cells", type=int, nargs="+", default=(0, 2000), help="moments of each body; 0: automatic")
+    parser.add_argument("--contact-model", default="dipole", choices=CONTACT_MODELS)
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
     write, table = line_writer(options.device), load()
     for name, cells in ((name, cells) for name in table for cells in options.cells):
         if name.startswith(tuple(options.names)):
-            write({"setup": name, "cells": cells, **errors(SETUPS[name], table[name], cells, options.device)})
+            values = errors(SETUPS[name], table[name], cells, options.device, options.contact_model)
+            write({"setup": name, "cells": cells, "contact_model": options.contact_model, **values})
 
 
-def errors(setup: Setup, reference: dict, cells: int = 0, device="cpu") -> dict:
+def errors(setup: Setup, reference: dict, cells: int = 0, device="cpu", contact_model: str = "dipole") -> dict:
     """Relative errors of warpmag's forces and moments of a setup, with about ``cells`` moments in each body.
 
     ``force_ratios`` and ``moment_ratios`` are values over those of the reference along them, one for each body.
     """
     began = time.perf_counter()
-    forces, moments, magnetics = model_forces(setup, cells, device)
+    forces, moments, magnetics = model_forces(setup, cells, device, contact_model)
     system, seconds = magnetics.system, time.perf_counter() - began
     expected_forces, expected_moments = np.array(reference["forces"]), np.array(reference["moments"])
     line = {"moment_error": float((_lengths(moments - expected_moments) / _lengths(expected_moments)).max())}
@@ -58,14 +61,17 @@ def errors(setup: Setup, reference: dict, cells: int = 0, device="cpu") -> dict:
     }
 
 
-def model_forces(setup: Setup, cells: int, device) -> tuple[np.ndarray, np.ndarray, warpmag.Magnetics]:
+def model_forces(
+    setup: Setup, cells: int, device, contact_model: str
+) -> tuple[np.ndarray, np.ndarray, warpmag.Magnetics]:
     """Forces [N] and moments [A·m²] of the bodies, shape [n, 3], in a Newton model; and its magnets."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     warpmag.register_custom_attributes(builder)
     for body in setup.bodies:
         _add(builder, body, cells)
     model = builder.finalize(device=device)
-    magnetics, state = warpmag.Magnetics(model, external_field=setup.field, rtol=_SETTLED), model.state()
+    settings = {"external_field": setup.field, "rtol": _SETTLED, "contact_model": contact_model}
+    magnetics, state = warpmag.Magnetics(model, **settings), model.state()
     state.clear_forces()
     magnetics.apply(state)
     moments = np.zeros((len(setup.bodies), 3))

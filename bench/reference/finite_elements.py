@@ -26,7 +26,7 @@ from warpmag.declarations.materials import MATERIALS
 
 RESOLUTIONS = {
     True: (Resolution(4, 3, 1.3), Resolution(5, 4, 1.0)),
-    False: (Resolution(2, 1, 1.8), Resolution(3, 2, 1.4)),
+    False: (Resolution(3, 1, 1.8), Resolution(3, 3, 1.4)),
 }
 """Coarse and fine elements of axial setups (True) and of others; the change between them is in the table."""
 _SECANTS, _NEWTON_STEPS = 6, 25

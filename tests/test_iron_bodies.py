@@ -1,0 +1,69 @@
+"""References of iron bodies near each other by finite elements, and warpmag's comparison with them."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from bench import iron
+from bench.reference.iron_bodies import SETUPS, Body, load
+from bench.reference.oracle import MU0
+from bench.reference.spheres import pair
+
+
+def test_every_setup_has_a_converged_reference():
+    """Finer elements change a force by less than 0.3 %, of setups without an axis by less than 1 %."""
+    table = load()
+    assert list(table) == list(SETUPS)
+    for name, row in table.items():
+        setup = SETUPS[name]
+        limit = 3e-3 if setup.is_axial else 1e-2
+        assert np.isfinite([row["forces"], row["moments"]]).all()
+        assert np.shape(row["forces"]) == np.shape(row["moments"]) == (len(setup.bodies), 3)
+        assert row["moment_change"] < limit, name
+        if len(setup.bodies) > 1:
+            assert row["force_change"] < limit and row["force_sum"] < limit, name
+
+
+@pytest.mark.parametrize("gap", [0.005, 0.2, 1.0, 5.0])
+def test_references_of_two_balls_are_the_exact_solution(gap):
+    """The domain ends at 30 sizes, which leaves 1e-4."""
+    setup, row = SETUPS[f"balls in line, gap {gap:g}"], load()[f"balls in line, gap {gap:g}"]
+    first, second = setup.bodies
+    exact = pair(math.dist(first.center, second.center), (0.005, 0.005), (1001.0, 1001.0))
+    moments = np.linalg.solve(exact.resistance[0], 2 * [setup.field[2]])
+    force = 0.5 * MU0 * moments @ exact.slope[0] @ moments
+    assert np.array(row["forces"])[:, 2] == pytest.approx([force, -force], rel=3e-4)
+    assert np.array(row["moments"])[:, 2] == pytest.approx(moments, rel=3e-4)
+
+
+def test_volume_of_a_body():
+    """The volume sets the spacing of a number of cells."""
+    sizes = {"ball": (0.005,), "cylinder": (0.01, 0.003), "box": (0.01, 0.02, 0.003)}
+    volumes = {shape: Body(shape, size, (0.0, 0.0, 0.0)).volume for shape, size in sizes.items()}
+    expected = {"ball": 4.0 / 3.0 * math.pi * 1.25e-7, "cylinder": math.pi * 1e-4 * 0.006, "box": 0.02 * 0.04 * 0.006}
+    assert volumes == pytest.approx(expected)
+
+
+def test_lines_compare_a_model_with_the_table(device, monkeypatch, capsys):
+    name = "cylinders in line, gap 5"
+    monkeypatch.setattr("sys.argv", ["iron", name, "--cells", "0", "--device", device])
+    iron.main()
+    (line,) = [json.loads(text) for text in capsys.readouterr().out.splitlines()]
+    assert line["setup"] == name and line["converged"]
+    # the gap is as wide as three cells: cells of 2 mm leave 2 %
+    assert line["force_error"] < 0.03 and line["moment_error"] < 0.03
+    assert line["force_ratios"][0] == pytest.approx(1.0 - line["force_error"], abs=1e-4)
+    assert line["force_sum"] < 1e-5
+
+
+def test_finite_elements_repeat_the_table():
+    """Another version of the mesh generator changes a force by no more than the coarse elements do."""
+    pytest.importorskip("ngsolve")
+    from bench.reference import finite_elements  # noqa: PLC0415 - needs NGSolve
+
+    name = "ball on plate, gap 1"
+    row, stored = finite_elements.solve(name), load()[name]
+    np.testing.assert_allclose(row["forces"], stored["forces"], atol=3e-3 * np.abs(stored["forces"]).max())
+    np.testing.assert_allclose(row["moments"], stored["moments"], atol=3e-3 * np.abs(stored["moments"]).max())
