@@ -3,9 +3,11 @@
 import math
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from bench.reference import oracle
+from bench.reference import boxes, oracle
 from bench.systems import moment_system
+from warpmag.kernels.cells import cell_pairs
 from warpmag.shapes import demagnetization, lattice, uniform_response
 
 FAINT = 1e12  # A/m, a saturation far above any field here
@@ -76,3 +78,15 @@ def demagnetizing_matrix(body, coupling=None):
 def coupled(body, solids):
     """Coupling of a body's cells, as a model has it."""
     return uniform_response.with_surface_response(demagnetization.coupling(body, body.radii), body, solids)
+
+
+def pair_corrections(bodies, couplings, poses):
+    """Tensors between cells of bodies at poses (rotation, position) by the float64 reference, shape [n, 3, n, 3]."""
+    cells = [
+        (turn.apply(x) + place, turn.as_matrix() @ Rotation.from_quat(coupling.grid_rotation).as_matrix(), half)
+        for body, coupling, (turn, place) in zip(bodies, couplings, poses, strict=True)
+        for x, half in zip(body.positions, coupling.half_sides, strict=True)
+    ]
+    labels = np.repeat(np.arange(len(bodies)), [len(body.volumes) for body in bodies])
+    windows = cell_pairs.WINDOW, cell_pairs.CLOSE, cell_pairs.CLOSE_POINTS
+    return boxes.body_corrections(cells, labels, *windows, cell_pairs.HARDENING)

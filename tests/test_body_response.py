@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+from cell_bodies import pair_corrections
 from scipy.spatial.transform import Rotation
 
 from bench.reference import oracle
@@ -50,15 +51,6 @@ class Scene:
         assert system.converged.numpy().all()
         return int(system.evaluations.numpy()[0])
 
-    def overlaps(self, x):
-        """Return Σ |B_i ∩ B_j|/√(V_i V_j) over the balls of other bodies."""
-        d, a, b = np.linalg.norm(x[:, None] - x, axis=2), self.radii[:, None], self.radii
-        labels = self.settings["bodies"]
-        meet = (d < a + b) & (labels[:, None] != labels)
-        d = np.where(meet, d, 1.0)
-        lens = np.pi * (a + b - d) ** 2 * (d * d + 2 * d * (a + b) - 3 * (a - b) ** 2) / (12 * d)
-        return np.where(meet, lens / (4.0 / 3.0 * np.pi * (a * b) ** 1.5), 0.0).sum(axis=1)
-
     def magnetizations(self, poses, field):
         """Return magnetizations by Newton's method with the dense matrix of all cells and balls, in float64."""
         x, n = self.places(poses), len(self.radii)
@@ -69,12 +61,10 @@ class Scene:
             tensors = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1).reshape(-1, 3, 3)
             i = first + np.repeat(np.arange(len(body.start) - 1), np.diff(body.start))
             extra[i, :, first + body.other] += turn.as_matrix() @ tensors @ turn.as_matrix().T
+        couplings = [coupling for _, coupling in self.couplings]
+        cells = sum(len(coupling.radii) for coupling in couplings)
+        extra[:cells, :, :cells] += pair_corrections(self.bodies, couplings, poses)
         extra *= volumes[:, None]
-        hardness = np.zeros(n)
-        for first, body in self.couplings:
-            own = slice(first, first + len(body.radii))
-            hardness[own] = body.hardening * self.overlaps(x)[own]
-        extra[np.arange(n), :, np.arange(n)] -= hardness[:, None, None] * np.eye(3)
         results = oracle.equilibrium(
             x, self.radii, field, saturation=MS, extra_coupling=extra.reshape(3 * n, 3 * n), tolerance=1e-12
         )

@@ -1,6 +1,5 @@
 """Cells of different bodies act on each other as boxes: tensors, forces, torques and touching iron."""
 
-import itertools
 import math
 
 import magpylib
@@ -8,13 +7,12 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from cell_bodies import FAINT
+from cell_bodies import FAINT, pair_corrections
 from scipy.spatial.transform import Rotation
 
 import warpmag
 from bench.reference import boxes, oracle
 from bench.systems import moment_system
-from warpmag.kernels.cells import cell_pairs
 from warpmag.shapes import demagnetization, lattice
 
 CUBE = lattice.fill(lattice.box([0.01] * 3), 0.0067, together=True)
@@ -70,24 +68,9 @@ def test_fields_between_bodies_are_those_of_boxes(pose, dtype, device):
     system.begin()
     system.evaluate()
     moments = system.moments.numpy().astype(float)
-    cells = [
-        (turn.apply(x) + place, turn.as_matrix() @ Rotation.from_quat(coupling.grid_rotation).as_matrix(), half)
-        for body, coupling, turn, place in zip(bodies, couplings, turns, places, strict=True)
-        for x, half in zip(body.positions, coupling.half_sides, strict=True)
-    ]
-    expected, lone = np.zeros((count, 3)), np.zeros((count, 3))
-    window, close = cell_pairs.WINDOW, cell_pairs.CLOSE
-    for i, j in itertools.product(range(count), range(count)):
-        if (i < n) != (j < n):
-            correction = boxes.pair_correction(cells[i], cells[j], window, close, cell_pairs.CLOSE_POINTS)
-            expected[i] += correction @ moments[j]
-    radii, positions = np.concatenate([CUBE.radii, PLATE.radii]), np.array([x for x, _, _ in cells])
-    reach = np.array([half.min() for _, _, half in cells])
-    distances = np.linalg.norm(positions[:, None] - positions, axis=2)
-    depth = np.maximum(1.0 - distances / (reach[:, None] + reach), 0.0)
-    depth[:n, :n] = depth[n:, n:] = 0.0
-    volumes = 4.0 / 3.0 * np.pi * radii**3
-    expected -= (cell_pairs.HARDENING * np.minimum(depth.sum(axis=1), 1.0) / volumes)[:, None] * moments
+    tensors = pair_corrections(bodies, couplings, list(zip(turns, places, strict=True)))
+    expected, lone = np.einsum("ikjl,jl->ik", tensors, moments), np.zeros((count, 3))
+    radii, positions = np.concatenate([CUBE.radii, PLATE.radii]), system.positions.numpy()
     for first, body, coupling, turn in zip((0, n), bodies, couplings, turns, strict=True):
         own = slice(first, first + len(body.volumes))
         i = np.repeat(np.arange(len(body.volumes)), np.diff(coupling.start))

@@ -212,6 +212,34 @@ def test_operator_of_a_body_is_positive(solid):
     assert values[-1] < 1.0
 
 
+SLENDER = {
+    "nail 20": (lattice.cylinder(0.5, 10.0), lambda chi: surface_integrals.cylinder_moments(20.0, chi, (40, 60))[:, 0]),
+    "nail 50": (lattice.cylinder(0.5, 25.0), lambda chi: surface_integrals.cylinder_moments(50.0, chi, (60, 90))[:, 0]),
+    "needle 40": (
+        lattice.ellipsoid([1.0, 1.0, 40.0]),
+        lambda chi: 1.0 / (demagnetizing_factors((1.0, 1.0, 40.0))[2] + 1.0 / np.array(chi)),
+    ),
+    "bar 30": (
+        lattice.box([0.5, 0.5, 15.0]), lambda chi: surface_integrals.box_moments((1.0, 1.0, 30.0), chi, (20, 30))[:, 2]
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SLENDER)
+def test_moments_along_slender_bodies_are_those_of_references(name):
+    """Their demagnetizing factor is at most 1e-3, so that inconsistent tensors of near and far cells would show."""
+    solid, reference = SLENDER[name]
+    chi = (10.0, 1000.0, math.inf)
+    body = lattice.fill(solid, across=lattice.LEAST_ACROSS, together=True)
+    matrix = demagnetizing_matrix(body, coupled(body, [solid]))
+    values, vectors = np.linalg.eigh(matrix)
+    assert values[0] > 0.0
+    along = np.kron(np.sqrt(body.volumes / body.volumes.sum()), [0.0, 0.0, 1.0]) @ vectors
+    moments = [(along**2 / (values + 1.0 / susceptibility)).sum() for susceptibility in chi]
+    # cells and surface; the references extrapolate to 1 % here
+    np.testing.assert_allclose(moments, reference(chi), rtol=0.03)
+
+
 @pytest.mark.parametrize("apart", [0.0, 0.004, 0.009, 0.01])
 def test_bodies_that_touch_or_intersect_have_one_solution(device, apart):
     """Two cubes of 10 mm and infinite permeability, also coincident, from different starts."""
@@ -280,20 +308,10 @@ def test_operator_of_bodies_that_intersect_is_positive(solid, spacing, device):
         places = spread * solid.upper.min() * rng.uniform(-1.0, 1.0, (count, 3))
         turns = Rotation.from_rotvec(turn * rng.normal(size=(count, 3)))
         system, operator = intersecting(body, coupling, places, list(turns), device)
-        assert np.linalg.eigvalsh(operator)[0] > -0.03 * coupling.hardening  # hardening is known to 3 %
+        assert np.linalg.eigvalsh(operator)[0] > -0.002  # the quadrature of boxes that intersect
         system.solve()
         assert system.converged.numpy().tolist() == [1]
-        assert system.evaluations.numpy()[0] < 50
-
-
-@pytest.mark.parametrize("solid", [lattice.box([0.02, 0.02, 0.0025]), lattice.cone(0.01, 0.02)], ids=["plate", "cone"])
-def test_hardening_is_what_balls_are_harder_by(solid):
-    body = lattice.fill(solid, (solid.volume / 150.0) ** (1 / 3))
-    coupling = coupled(body, [solid])
-    nothing = replace(coupling, tensor=np.zeros_like(coupling.tensor), common=np.zeros_like(coupling.common))
-    harder = demagnetizing_matrix(body, nothing) - demagnetizing_matrix(body, coupling)
-    truth = np.linalg.eigvalsh(0.5 * (harder + harder.T))[-1]
-    assert 0.97 * truth < coupling.hardening <= truth * (1.0 + 1e-9)  # 20 Lanczos steps converge from below
+        assert system.evaluations.numpy()[0] < 120
 
 
 def coenergy(system):
@@ -404,9 +422,14 @@ def test_bodies_of_one_shape_share_a_table_and_balls_have_none(device):
     assert warpmag.Magnetics(balls.finalize(device=device)).system.rotations is None
 
 
-def test_thin_bodies_have_several_cells_across():
-    for half in ([0.02, 0.02, 1e-4], [0.001, 0.001, 0.1]):
-        body = lattice.fill(lattice.box(half), across=lattice.LEAST_ACROSS)
+def test_cells_of_slender_bodies_are_nearly_cubic():
+    """A body has several cells across unless they would be flat or long."""
+    for half, across in (([0.02, 0.02, 0.0025], 3), ([0.02, 0.02, 0.001], 2), ([0.05, 0.05, 0.001], 1)):
+        body = lattice.fill(lattice.box(half), across=lattice.LEAST_ACROSS, together=True)
+        assert len(np.unique(body.positions[:, 2].round(9))) == across
+        assert 0.9 * lattice.AUTOMATIC_COUNT < len(body.volumes) <= lattice.AUTOMATIC_COUNT
+    for half in ([0.001, 0.001, 0.02], [0.001, 0.001, 0.1], [0.05, 0.005, 0.001]):
+        body = lattice.fill(lattice.box(half), across=lattice.LEAST_ACROSS, together=True)
+        _, middle, most = np.sort(body.pieces[0].sides)
+        assert most <= lattice.LONGEST * middle
         assert len(body.volumes) <= lattice.AUTOMATIC_COUNT
-        for axis in range(3):
-            assert len(np.unique(body.positions[:, axis].round(9))) >= lattice.LEAST_ACROSS

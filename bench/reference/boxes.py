@@ -62,6 +62,8 @@ def pair_correction(a, b, window, close, points: int) -> np.ndarray:
     sizes = [2.0 * h.max() ** 1.5 / np.sqrt(h.min()) for h in (half, other_half)]
     radii = [np.cbrt(8.0 * h.prod() * 0.75 / np.pi) for h in (half, other_half)]
     distance = d / np.mean(sizes)
+    if distance >= window[1]:
+        return np.zeros((3, 3))
 
     def both(count):
         of_b = mean_tensor(other_turn.T @ r, other_turn.T @ turn, other_half, half, count)
@@ -73,3 +75,24 @@ def pair_correction(a, b, window, close, points: int) -> np.ndarray:
     near = fade(distance, close)
     tensor = near * (0.5 * both(points) - ball) + (1.0 - near) * (both(1) - 2.0 * ball)
     return fade(distance, window) * tensor
+
+
+def body_corrections(cells, bodies, window, close, points: int, hardening: float) -> np.ndarray:
+    """Tensors between cells of different bodies [1/m³], shape [n, 3, n, 3]: H_i is the sum of T_ij m_j.
+
+    Args:
+        cells: Position [m], rotation matrix and half sides [m] of each cell.
+        bodies: Body of each cell, shape [n].
+        window, close, points: As for :func:`pair_correction`.
+        hardening: Demagnetizing factor added to a cell inside another body.
+    """
+    n, tensors, depth = len(cells), np.zeros((len(cells), 3, len(cells), 3)), np.zeros(len(cells))
+    for i, j in itertools.combinations(range(n), 2):
+        if bodies[i] != bodies[j]:
+            tensors[i, :, j] = tensors[j, :, i] = pair_correction(cells[i], cells[j], window, close, points)
+            inscribed = cells[i][2].min() + cells[j][2].min()
+            depth[[i, j]] += max(1.0 - np.linalg.norm(cells[i][0] - cells[j][0]) / inscribed, 0.0)
+    volumes = np.array([8.0 * half.prod() for _, _, half in cells])
+    hardness = hardening * np.minimum(depth, 1.0) / volumes
+    tensors[np.arange(n), :, np.arange(n)] -= hardness[:, None, None] * np.eye(3)
+    return tensors

@@ -5,11 +5,11 @@ cells that are near each other act on each other as boxes, at the present poses 
 candidates are found by the neighbor search of ``pairs.neighbors``. The tensor of a pair is kept while the relative pose
 of its bodies rests.
 
-Bodies do not overlap, so that the operator of induction is positive: it is the exact one, integrated by Gauss points.
-Bodies that intersect make it slightly negative. The demagnetizing factor of cells that overlap other bodies therefore
-grows (``couplings.py``).
+The operator of induction is positive for disjoint bodies: it is the exact one, integrated by Gauss points. For bodies
+that intersect the points can make it negative. So a cell inside another body gets an additional demagnetizing factor.
 """
 
+import math
 from functools import cache
 
 import numpy as np
@@ -19,7 +19,7 @@ from warpmag.kernels.pairs import neighbors
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
-from warpmag.kernels.shared.team import team, threads_for
+from warpmag.kernels.shared.team import launch_passes, threads_for
 
 WINDOW = 2.5, 3.5
 """Distances at which boxes start to turn into balls and are balls, in means of their sizes: the longest side times the
@@ -31,9 +31,12 @@ CLOSE_POINTS = 2
 HARDENING = 0.3
 """Demagnetizing factor added to a cell inside another body. Quadrature over intersecting boxes leaves eigenvalues of
 -0.05."""
-CAPACITY = 384
-"""Longest list of candidates. A face cell of a cube has 50 to 60, a cell inside another body 110, and one in a stack of
-five sheets up to 150. Cells with more take no part."""
+_LONGEST_LIST = 2048
+"""Longest list of candidates. A face cell of a cube has 50 to 60, one in a stack of five sheets up to 500."""
+_SHORTEST_LIST = 64
+"""Shortest list of candidates."""
+_SAMPLES = 32
+"""Points whose neighbors are counted for the length of the lists."""
 _MARGIN = 0.15
 """Fraction of its radius that a cell may move before candidates are searched again."""
 LOCATE, CLEAR, SELECT, TABULATE, ADD_FIELD, ADD_FORCE = range(6)
@@ -46,7 +49,7 @@ _CELLS_PER_THREAD = 100
 
 @cache
 def cell_pairs_type(dtype):
-    """Return the struct of the arrays, for n moments, b bodies with cells, and rows of cells with candidates."""
+    """Return the struct of the arrays, for n moments, b bodies with cells, c of them, and rows with candidates."""
     vec3, quaternion = wp.types.vector(3, dtype), wp.types.quaternion(dtype)
 
     @wp.struct
@@ -68,16 +71,18 @@ def cell_pairs_type(dtype):
         crowded: wp.array[int]  # 1 if a cell had more candidates than its list holds, shape [1]
         # Work:
         frame: wp.array[quaternion]  # from the frame of each body's grid to the world, shape [b]
-        candidate: wp.array2d[int]  # moments that are or may become near, shape [n, CAPACITY]
+        candidate: wp.array2d[int]  # moments that are or may become near, shape [n, capacity]
         candidate_count: wp.array[int]  # their number, which may exceed the capacity, shape [n]
         found_at: wp.array[vec3]  # positions at the last search [m], shape [n]
         moved: wp.array[int]  # 1 if a cell has moved too far since then, shape [1]
         searching: wp.array[int]  # nonzero if the last search rebuilt the lists, shape [1]
         rows: wp.array[int]  # number of rows, shape [1]
-        cell: wp.array[int]  # cell of each row, shape [padded]
-        pose: wp.array[dtype]  # relative pose of each tensor, shape [padded / CHUNK, CAPACITY, 7, CHUNK], flat
-        hardness: wp.array[dtype]  # demagnetizing factor added where bodies intersect, over the volume [1/m³], [padded]
-        tensor: wp.array[dtype]  # T_ij [1/m³] in the frame of box i, shape [padded / CHUNK, CAPACITY, 6, CHUNK], flat
+        cell: wp.array[int]  # cell of each row, shape [c padded]
+        pose: wp.array[dtype]  # relative pose of each tensor, shape [c padded / CHUNK, capacity, 7, CHUNK], flat
+        hardness: wp.array[
+            dtype
+        ]  # demagnetizing factor added where bodies intersect, over the volume [1/m³], shape [c padded]
+        tensor: wp.array[dtype]  # T_ij [1/m³] in the frame of box i, shape [c padded / CHUNK, capacity, 6, CHUNK], flat
 
     return CellPairs
 
@@ -100,10 +105,31 @@ def _kernel(dtype, group: int):
         "cells/cell_pairs.h",
         arguments,
         dtype=dtype,
-        CAPACITY=CAPACITY,
         GROUP=group,
         **constants,
     )
+
+
+def _list_length(bodies, group, reach: float) -> int:
+    """Return the length of lists for candidates up to ``reach`` [m]: all bodies of a world around a cell, or a solid.
+
+    Bodies that intersect can have more candidates.
+    """
+    near = {id(coupling): _most_near(coupling.positions, reach) for _, coupling in bodies}
+    counts = np.zeros(group.max() + 1)
+    np.add.at(counts, [group[first] for first, _ in bodies], [near[id(coupling)] for _, coupling in bodies])
+    volume = min(float(np.prod(2.0 * coupling.half_sides, axis=1).max()) for _, coupling in bodies)
+    solid = 4.0 / 3.0 * np.pi * reach**3 / volume
+    needed = np.clip(min(counts.max(), solid), _SHORTEST_LIST, _LONGEST_LIST)
+    return 2 ** math.ceil(math.log2(needed))  # the search is compiled for each length
+
+
+def _most_near(points: np.ndarray, reach: float) -> int:
+    """Return the largest number of points within ``reach`` [m] of one of :data:`_SAMPLES` points."""
+    samples = points[:: -(-len(points) // _SAMPLES)]
+    middle = points[[np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1))]]
+    distances = np.linalg.norm(np.concatenate([middle, samples])[:, None] - points, axis=2)
+    return int((distances <= reach).sum(axis=1).max())
 
 
 class CellPairs:
@@ -127,7 +153,6 @@ class CellPairs:
     def __init__(self, bodies, rotations, worlds, movable, packed, moments, h, forces, torques):
         """Lay out the arrays on the device of the moments."""
         dtype, device, n = packed.dtype, packed.device, packed.count
-        padded = -(-n // CHUNK) * CHUNK
         group, body, half = np.full(n, -1), np.zeros(n, int), np.ones((4, n))
         for number, (first, coupling) in enumerate(bodies):
             cells = slice(first, first + len(coupling.radii))
@@ -137,6 +162,8 @@ class CellPairs:
         radii = packed.radii.numpy()
         ratio = WINDOW[1] * float((0.5 * half[3] / radii)[group >= 0].max()) + _MARGIN
         reach = 2.0 * float(radii[group >= 0].max())
+        capacity = _list_length(bodies, group, ratio * reach)
+        padded = -(-int((group >= 0).sum()) // CHUNK) * CHUNK
 
         def put(values, kind=wp.int32):
             return wp.array(np.ascontiguousarray(values), dtype=kind, device=device)
@@ -145,7 +172,7 @@ class CellPairs:
             return wp.zeros(shape, dtype=kind, device=device)
 
         self._lists = lists = neighbors.allocate(
-            n, packed.packed, put(group), reach=reach, ratio=ratio, capacity=CAPACITY, bodies=body
+            n, packed.packed, put(group), reach=reach, ratio=ratio, capacity=capacity, bodies=body
         )
         self._pairs = a = cell_pairs_type(dtype)()
         quaternion = wp.types.quaternion(dtype)
@@ -156,26 +183,19 @@ class CellPairs:
         a.moved, a.searching, a.frame = lists.moved, lists.searching, zeros(len(bodies), kind=quaternion)
         self.crowded = a.crowded = zeros(1)
         a.rows, a.cell, a.hardness = zeros(1), zeros(padded), zeros(padded, kind=dtype)
-        a.pose = zeros(padded * CAPACITY * _POSE_ROWS, kind=dtype)
-        a.tensor = zeros(padded * CAPACITY * _TENSOR_ROWS, kind=dtype)
+        a.pose = zeros(padded * capacity * _POSE_ROWS, kind=dtype)
+        a.tensor = zeros(padded * capacity * _TENSOR_ROWS, kind=dtype)
         self._locate, self._tabulate = self._record(LOCATE, LOCATE), self._record(CLEAR, TABULATE)
         self._field, self._force = self._record(ADD_FIELD, ADD_FIELD), self._record(ADD_FORCE, ADD_FORCE)
 
     def _record(self, first: int, last: int) -> list:
         """Return launches of passes ``first`` to ``last``: one on a CPU, one each on a GPU."""
         pairs, device = self._pairs, self._pairs.h.device
-        group, rows = group_threads(device), pairs.cell.shape[0]
-        passes = [(k, k + 1) for k in range(first, last + 1)] if device.is_cuda else [(first, last + 1)]
-        return [
-            wp.launch(
-                _kernel(pairs.packed.dtype, group),
-                dim=group * rows if device.is_cuda else 1,
-                inputs=[begin, end, threads_for(rows, _CELLS_PER_THREAD), None if device.is_cuda else team(), pairs],
-                device=device,
-                record_cmd=True,
-            )
-            for begin, end in passes
-        ]
+        group, rows = group_threads(device), max(pairs.cell.shape[0], pairs.group.shape[0])
+        kernel = _kernel(pairs.packed.dtype, group)
+        sizes = dict(threads=threads_for(rows, _CELLS_PER_THREAD), gpu_threads=group * rows)
+        ranges = [(k, k + 1) for k in range(first, last + 1)] if device.is_cuda else [(first, last + 1)]
+        return [launch_passes(kernel, *ends, pairs, device=device, record_cmd=True, **sizes) for ends in ranges]
 
     def find(self):
         """Launch the search for near cells, and compute the tensors of pairs that have moved."""
@@ -196,5 +216,6 @@ class CellPairs:
             launch.launch()
 
     def persistent_arrays(self) -> dict[str, wp.array]:
-        """Return the arrays that the next search reads, by name."""
-        return neighbors.persistent_lists(self._lists)
+        """Return the arrays that the next search and the next evaluation read, by name."""
+        kept = ("rows", "cell", "pose", "tensor", "hardness", "crowded")
+        return neighbors.persistent_lists(self._lists) | {name: getattr(self._pairs, name) for name in kept}
