@@ -88,5 +88,4 @@ def pair_corrections(bodies, couplings, poses):
         for x, half in zip(body.positions, coupling.half_sides, strict=True)
     ]
     labels = np.repeat(np.arange(len(bodies)), [len(body.volumes) for body in bodies])
-    windows = cell_pairs.WINDOW, cell_pairs.CLOSE, cell_pairs.CLOSE_POINTS
-    return boxes.body_corrections(cells, labels, *windows, cell_pairs.HARDENING)
+    return boxes.body_corrections(cells, labels, cell_pairs.WINDOW, cell_pairs.CLOSE, cell_pairs.HARDENING)

@@ -1,7 +1,6 @@
 """Uniformly magnetized boxes that act on each other, in float64: what ``kernels/cells/cell_pairs.h`` computes.
 
-The windows and the number of Gauss points are those of ``warpmag.kernels.cells.cell_pairs``; all formulas are derived
-again.
+The windows are those of ``warpmag.kernels.cells.cell_pairs``; all formulas are derived again.
 """
 
 import itertools
@@ -31,16 +30,25 @@ def field_tensor(r: np.ndarray, half: np.ndarray) -> np.ndarray:
     return tensor / (4.0 * np.pi)
 
 
-def mean_tensor(r, rotation, half, other_half, points: int) -> np.ndarray:
-    """Field tensor of a box over its volume, averaged over Gauss points of another one [1/m³], shape [3, 3].
+def mean_tensor(r, rotation, half, other_half) -> np.ndarray:
+    """Field tensor of a box over its volume, averaged over 2³ Gauss points of another one [1/m³], shape [3, 3].
 
     ``r`` is the position of the other box and ``rotation`` its rotation, both in the frame of the box.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(points)
+    nodes, _ = np.polynomial.legendre.leggauss(2)
     places = np.array(list(itertools.product(nodes, repeat=3))) * other_half
-    weight = np.array([np.prod(w) for w in itertools.product(0.5 * weights, repeat=3)])
-    tensors = field_tensor(r + places @ rotation.T, half)
-    return np.einsum("n,nkl->kl", weight, tensors) / (8.0 * np.prod(half))
+    return field_tensor(r + places @ rotation.T, half).mean(axis=0) / (8.0 * np.prod(half))
+
+
+def quadrupole_tensor(r: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """½ Σ S_cd ∂_a ∂_b ∂_c ∂_d of 1/(4πr) [1/m³], shape [3, 3], for the ``spread`` S [m²] of two boxes."""
+    d, eye = np.linalg.norm(r), np.eye(3)
+    fourth = 105.0 * np.einsum("a,b,c,d->abcd", r, r, r, r) / d**9
+    for one, two in (("ab", "cd"), ("ac", "bd"), ("ad", "bc"), ("bc", "ad"), ("bd", "ac"), ("cd", "ab")):
+        fourth -= 15.0 * np.einsum(f"{one},{two[0]},{two[1]}->abcd", eye, r, r) / d**7
+    for one, two in (("ab", "cd"), ("ac", "bd"), ("ad", "bc")):
+        fourth += 3.0 * np.einsum(f"{one},{two}->abcd", eye, eye) / d**5
+    return 0.5 * np.einsum("cd,abcd->ab", spread, fourth) / (4.0 * np.pi)
 
 
 def fade(distance: float, window: tuple[float, float]) -> float:
@@ -49,47 +57,44 @@ def fade(distance: float, window: tuple[float, float]) -> float:
     return float(t * t * (3.0 - 2.0 * t))
 
 
-def pair_correction(a, b, window, close, points: int) -> np.ndarray:
+def pair_correction(a, b, window, close) -> np.ndarray:
     """Tensor of a pair of boxes less that of balls of their volumes [1/m³], shape [3, 3].
 
     Args:
         a, b: Boxes: position [m], rotation matrix, half sides [m].
         window, close: Windows of all boxes and of boxes integrated over, in mean sizes.
-        points: Gauss points of close boxes along each axis.
     """
     (x, turn, half), (y, other_turn, other_half) = a, b
     r, d = x - y, np.linalg.norm(x - y)
-    sizes = [2.0 * h.max() ** 1.5 / np.sqrt(h.min()) for h in (half, other_half)]
+    sizes = [2.0 * h.max() * np.sqrt(min(h.max() / h.min(), 2.5)) for h in (half, other_half)]
     radii = [np.cbrt(8.0 * h.prod() * 0.75 / np.pi) for h in (half, other_half)]
     distance = d / np.mean(sizes)
     if distance >= window[1]:
         return np.zeros((3, 3))
 
-    def both(count):
-        of_b = mean_tensor(other_turn.T @ r, other_turn.T @ turn, other_half, half, count)
-        of_a = mean_tensor(-turn.T @ r, turn.T @ other_turn, half, other_half, count)
-        return other_turn @ of_b @ other_turn.T + turn @ of_a @ turn.T
-
+    of_b = other_turn @ mean_tensor(other_turn.T @ r, other_turn.T @ turn, other_half, half) @ other_turn.T
+    of_a = turn @ mean_tensor(-turn.T @ r, turn.T @ other_turn, half, other_half) @ turn.T
+    spread = turn @ np.diag(half**2 / 3.0) @ turn.T + other_turn @ np.diag(other_half**2 / 3.0) @ other_turn.T
     g1, g2, _ = oracle.radial_factors(np.array([d]), radii[0], radii[1])
     ball = (g1[0] * np.eye(3) + g2[0] * np.outer(r, r)) / (4.0 * np.pi)
     near = fade(distance, close)
-    tensor = near * (0.5 * both(points) - ball) + (1.0 - near) * (both(1) - 2.0 * ball)
+    tensor = near * (0.5 * (of_a + of_b) - ball) + (1.0 - near) * quadrupole_tensor(r, spread)
     return fade(distance, window) * tensor
 
 
-def body_corrections(cells, bodies, window, close, points: int, hardening: float) -> np.ndarray:
+def body_corrections(cells, bodies, window, close, hardening: float) -> np.ndarray:
     """Tensors between cells of different bodies [1/m³], shape [n, 3, n, 3]: H_i is the sum of T_ij m_j.
 
     Args:
         cells: Position [m], rotation matrix and half sides [m] of each cell.
         bodies: Body of each cell, shape [n].
-        window, close, points: As for :func:`pair_correction`.
+        window, close: As for :func:`pair_correction`.
         hardening: Demagnetizing factor added to a cell inside another body.
     """
     n, tensors, depth = len(cells), np.zeros((len(cells), 3, len(cells), 3)), np.zeros(len(cells))
     for i, j in itertools.combinations(range(n), 2):
         if bodies[i] != bodies[j]:
-            tensors[i, :, j] = tensors[j, :, i] = pair_correction(cells[i], cells[j], window, close, points)
+            tensors[i, :, j] = tensors[j, :, i] = pair_correction(cells[i], cells[j], window, close)
             inscribed = cells[i][2].min() + cells[j][2].min()
             depth[[i, j]] += max(1.0 - np.linalg.norm(cells[i][0] - cells[j][0]) / inscribed, 0.0)
     volumes = np.array([8.0 * half.prod() for _, _, half in cells])

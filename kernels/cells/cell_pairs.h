@@ -17,7 +17,9 @@ namespace warpmag {
 constexpr int TENSOR_ROWS = 6, POSE_ROWS = 7; // xx, yy, zz, xy, yz, zx; position and quaternion of box j
 constexpr Real POSE_TOLERANCE = Real(1e-6);   // largest change of a pose that counts as rest: float32 rounding
 
-enum CellPairPass { LOCATE, CLEAR, SELECT, TABULATE, ADD_FIELD, ADD_FORCE }; // as in cell_pairs.py
+constexpr int BINS = 64; // of rows by their number of close candidates; as in cell_pairs.py
+
+enum CellPairPass { LOCATE, CLEAR, SELECT, ARRANGE, PLACE, TABULATE, ADD_FIELD, ADD_FORCE }; // as in cell_pairs.py
 
 // Writes the frame of body i, and raises a flag if cell i has moved so far that candidates are searched again.
 template <class Pairs> CUDA_CALLABLE inline void locate(const Pairs& a, int i) {
@@ -34,11 +36,11 @@ template <class Pairs> CUDA_CALLABLE inline void locate(const Pairs& a, int i) {
     const size_t pitch = a.packed.strides[0] / sizeof(Real);
     const Real* const listed = (const Real*)a.found_at.data + 3 * (size_t)i;
     const Real x = row[0] - listed[0], y = row[pitch] - listed[1], z = row[2 * pitch] - listed[2];
-    const Real limit = MARGIN * row[3 * pitch];
+    const Real limit = MARGIN / 2 * a.half.data[i + 3 * (size_t)a.half.shape[1]];
     if (!(x * x + y * y + z * z <= limit * limit)) raise_flag(*a.moved.data);
 }
 
-CUDA_CALLABLE inline int next_row(int* count) {
+CUDA_CALLABLE inline int increment(int* count) {
 #if defined(__CUDA_ARCH__)
     return atomicAdd(count, 1);
 #else
@@ -46,41 +48,62 @@ CUDA_CALLABLE inline int next_row(int* count) {
 #endif
 }
 
-// Orders the candidates of cell i by distance, so that the first slots of all rows have close pairs.
-template <class Pairs> CUDA_CALLABLE inline void sort_candidates(const Pairs& a, int i, int count) {
+// Orders the candidates of cell i by distance, and returns the number of those that may be close.
+template <class Pairs> CUDA_CALLABLE inline int sort_candidates(const Pairs& a, int i, int count) {
     const Real* const x = (const Real*)a.packed.data;
     const size_t pitch = a.packed.strides[0] / sizeof(Real);
+    const Real* const size = a.half.data + 3 * (size_t)a.half.shape[1];
     int* const list = a.candidate.data + (size_t)i * a.candidate.shape[1];
-    auto distance = [=](int j) {
+    auto square = [=](int j) {
         const Real r[3] = {x[j] - x[i], x[j + pitch] - x[i + pitch], x[j + 2 * pitch] - x[i + 2 * pitch]};
         return r[0] * r[0] + r[1] * r[1] + r[2] * r[2];
     };
-    for (int k = 1; k < count; ++k) {
+    int close = 0;
+    for (int k = 0; k < count; ++k) {
         const int j = list[k];
-        const Real d = distance(j);
+        const Real d = square(j), reach = (CLOSE_END + MARGIN) / 2 * (size[i] + size[j]);
+        close += d < reach * reach;
         int place = k;
         for (; place > 0; --place) {
             const int other = list[place - 1];
-            const Real at = distance(other);
+            const Real at = square(other);
             if (at < d || (at == d && other < j)) break;
             list[place] = other;
         }
         list[place] = j;
     }
+    return close;
 }
 
-// Gives a row to cell i after a search if it has candidates. Cells with too many candidates have none.
+// Prepares cell i for a row after a search, if it has candidates. Cells with too many candidates have none.
 template <class Pairs> CUDA_CALLABLE inline void select(const Pairs& a, int i) {
-    if (a.searching.data[0] == 0 || i >= a.group.shape[0] || a.group.data[i] < 0) return;
-    const int count = a.candidate_count.data[i], capacity = a.candidate.shape[1];
-    if (count > capacity) raise_flag(*a.crowded.data);
-    if (count == 0 || count > capacity) return;
-    sort_candidates(a, i, count);
-    const int row = next_row(a.rows.data);
+    a.bin.data[i] = -1;
+    const int count = a.group.data[i] < 0 ? 0 : a.candidate_count.data[i];
+    if (count > a.candidate.shape[1]) raise_flag(*a.crowded.data);
+    if (count == 0 || count > a.candidate.shape[1]) return;
+    const int close = sort_candidates(a, i, count);
+    a.bin.data[i] = close < BINS ? BINS - 1 - close : 0;
+    increment(a.bin_end.data + a.bin.data[i]);
+}
+
+// Makes the counts of the bins their first rows. Rows of a vector then have similar numbers of close candidates.
+template <class Pairs> CUDA_CALLABLE inline void arrange(const Pairs& a) {
+    int rows = 0;
+    for (int k = 0; k < BINS; ++k) {
+        const int count = a.bin_end.data[k];
+        a.bin_end.data[k] = rows;
+        rows += count;
+    }
+    a.rows.data[0] = rows;
+}
+
+// Gives a row to cell i, with poses of no pair, so that all entries are computed.
+template <class Pairs> CUDA_CALLABLE inline void place(const Pairs& a, int i) {
+    if (a.bin.data[i] < 0) return;
+    const int row = increment(a.bin_end.data + a.bin.data[i]), count = a.candidate_count.data[i];
     a.cell.data[row] = i;
     Real* const poses = a.pose.data;
-    for (int slot = 0; slot < count; ++slot) // a pose of no pair: the entry is computed
-        slot_at(poses, capacity, POSE_ROWS, slot, row)[3 * CHUNK] = 9;
+    for (int slot = 0; slot < count; ++slot) slot_at(poses, a.candidate.shape[1], POSE_ROWS, slot, row)[3 * CHUNK] = 9;
 }
 
 // Cells of a vector of rows, or their candidates: index, and 0 where there is none.
@@ -259,6 +282,16 @@ template <class Pairs> CUDA_CALLABLE inline void add_force(const Pairs& a, int r
     add_to_cells((Real*)a.torques.data, own, movable, to_world(frame, group_sums(torque)), MU0);
 }
 
+// The passes that arrange rows after a search.
+template <class Pairs> CUDA_CALLABLE inline void arrange_rows(const Pairs& a, int pass, int i) {
+    if (a.searching.data[0] == 0) return;
+    if (pass == CLEAR && i < BINS) a.bin_end.data[i] = 0;
+    if (pass == ARRANGE && i == 0) arrange(a);
+    if (i >= a.group.shape[0]) return;
+    if (pass == SELECT) select(a, i);
+    if (pass == PLACE) place(a, i);
+}
+
 template <class Pairs> CUDA_CALLABLE inline void make_cell_pair_pass(const Pairs& a, int pass, int i) {
     if (pass >= TABULATE) {
         if (i >= a.cell.shape[0]) return;
@@ -269,8 +302,7 @@ template <class Pairs> CUDA_CALLABLE inline void make_cell_pair_pass(const Pairs
     }
     for (int l = 0; l < WIDTH && share() == 0; ++l)
         if (pass == LOCATE) locate(a, i + l);
-        else if (pass == SELECT) select(a, i + l);
-        else if (i + l == 0 && a.searching.data[0] != 0) a.rows.data[0] = 0;
+        else arrange_rows(a, pass, i + l);
 }
 
 template <class Word, class Pairs>
@@ -278,8 +310,8 @@ CUDA_CALLABLE inline void add_cell_pairs(int thread, int first, int last, int th
 #if defined(__CUDA_ARCH__)
     make_cell_pair_pass(a, first, thread / GROUP);
 #else
-    run_passes(team, threads, first, last, CHUNK * ((a.group.shape[0] + CHUNK - 1) / CHUNK), WIDTH,
-               [&](int pass, int i) { make_cell_pair_pass(a, pass, i); });
+    const int most = a.group.shape[0] > BINS ? a.group.shape[0] : BINS, items = CHUNK * ((most + CHUNK - 1) / CHUNK);
+    run_passes(team, threads, first, last, items, WIDTH, [&](int pass, int i) { make_cell_pair_pass(a, pass, i); });
 #endif
 }
 }

@@ -24,10 +24,11 @@ from warpmag.kernels.shared.team import launch_passes, threads_for
 WINDOW = 2.5, 3.5
 """Distances at which boxes start to turn into balls and are balls, in means of their sizes: the longest side times the
 root of its ratio to the shortest. Dipoles lack the quadrupole of flat cells, and need more distance."""
+_FLATTEST = 2.5
+"""Largest ratio of sides that increases a size, that of whole cells at automatic spacing. Flatter cells are parts that
+a surface cuts off, of little volume."""
 CLOSE = 1.75, 2.25
-"""Distances at which the average over close boxes turns into the field at their centers, in the same unit."""
-CLOSE_POINTS = 2
-"""Gauss points of close boxes along each axis."""
+"""Distances at which the average over close boxes turns into their quadrupoles, in the same unit."""
 HARDENING = 0.3
 """Demagnetizing factor added to a cell inside another body. Quadrature over intersecting boxes leaves eigenvalues of
 -0.05."""
@@ -37,12 +38,14 @@ _SHORTEST_LIST = 64
 """Shortest list of candidates."""
 _SAMPLES = 32
 """Points whose neighbors are counted for the length of the lists."""
-_MARGIN = 0.15
-"""Fraction of its radius that a cell may move before candidates are searched again."""
-LOCATE, CLEAR, SELECT, TABULATE, ADD_FIELD, ADD_FORCE = range(6)
+_MARGIN = 0.2
+"""Part of half its size that a cell may move before candidates are searched again."""
+LOCATE, CLEAR, SELECT, ARRANGE, PLACE, TABULATE, ADD_FIELD, ADD_FORCE = range(8)
 """The passes, in order; as in ``cell_pairs.h``."""
 _TENSOR_ROWS, _POSE_ROWS = 6, 7
 """Numbers of a tensor and of a relative pose; as in ``cell_pairs.h``."""
+_BINS = 64
+"""Bins of rows by their number of close candidates; as in ``cell_pairs.h``."""
 _CELLS_PER_THREAD = 100
 """Fewest cells per thread of a CPU."""
 
@@ -77,6 +80,8 @@ def cell_pairs_type(dtype):
         moved: wp.array[int]  # 1 if a cell has moved too far since then, shape [1]
         searching: wp.array[int]  # nonzero if the last search rebuilt the lists, shape [1]
         rows: wp.array[int]  # number of rows, shape [1]
+        bin: wp.array[int]  # bin of each moment by its number of close candidates, −1 for no row, shape [n]
+        bin_end: wp.array[int]  # end of each bin's rows, shape [BINS]
         cell: wp.array[int]  # cell of each row, shape [c padded]
         pose: wp.array[dtype]  # relative pose of each tensor, shape [c padded / CHUNK, capacity, 7, CHUNK], flat
         hardness: wp.array[
@@ -92,7 +97,6 @@ def _kernel(dtype, group: int):
     arguments = {**PASS_ARGUMENTS, "arrays": cell_pairs_type(dtype)}
     constants = dict(
         HARDENING=HARDENING,
-        CLOSE_POINTS=CLOSE_POINTS,
         CLOSE_BEGIN=CLOSE[0],
         CLOSE_END=CLOSE[1],
         WINDOW_BEGIN=WINDOW[0],
@@ -118,8 +122,13 @@ def _list_length(bodies, group, reach: float) -> int:
     near = {id(coupling): _most_near(coupling.positions, reach) for _, coupling in bodies}
     counts = np.zeros(group.max() + 1)
     np.add.at(counts, [group[first] for first, _ in bodies], [near[id(coupling)] for _, coupling in bodies])
-    volume = min(float(np.prod(2.0 * coupling.half_sides, axis=1).max()) for _, coupling in bodies)
-    solid = 4.0 / 3.0 * np.pi * reach**3 / volume
+    solid = (
+        4.0
+        / 3.0
+        * np.pi
+        * reach**3
+        / np.mean([np.prod(2.0 * coupling.half_sides, axis=1).max() for _, coupling in bodies])
+    )
     needed = np.clip(min(counts.max(), solid), _SHORTEST_LIST, _LONGEST_LIST)
     return 2 ** math.ceil(math.log2(needed))  # the search is compiled for each length
 
@@ -158,10 +167,9 @@ class CellPairs:
             cells = slice(first, first + len(coupling.radii))
             sides = coupling.half_sides.T
             group[cells], body[cells], half[:3, cells] = worlds[cells], number, sides
-            half[3, cells] = 2.0 * sides.max(axis=0) ** 1.5 / np.sqrt(sides.min(axis=0))
-        radii = packed.radii.numpy()
-        ratio = WINDOW[1] * float((0.5 * half[3] / radii)[group >= 0].max()) + _MARGIN
-        reach = 2.0 * float(radii[group >= 0].max())
+            most, least = sides.max(axis=0), sides.min(axis=0)
+            half[3, cells] = 2.0 * most * np.sqrt(np.minimum(most / least, _FLATTEST))
+        ratio, reach = WINDOW[1] + _MARGIN, float(half[3, group >= 0].max())
         capacity = _list_length(bodies, group, ratio * reach)
         padded = -(-int((group >= 0).sum()) // CHUNK) * CHUNK
 
@@ -172,8 +180,9 @@ class CellPairs:
             return wp.zeros(shape, dtype=kind, device=device)
 
         self._lists = lists = neighbors.allocate(
-            n, packed.packed, put(group), reach=reach, ratio=ratio, capacity=capacity, bodies=body
-        )
+            n, packed.packed, put(group), reach=reach, ratio=ratio, capacity=capacity,
+            radii=put(0.5 * half[3], dtype), bodies=body,
+        )  # fmt: skip
         self._pairs = a = cell_pairs_type(dtype)()
         quaternion = wp.types.quaternion(dtype)
         a.group, a.body, a.half, a.movable = put(group), put(body), put(half, dtype), put(movable)
@@ -182,7 +191,8 @@ class CellPairs:
         a.candidate, a.candidate_count, a.found_at = lists.neighbor, lists.count, lists.found_at
         a.moved, a.searching, a.frame = lists.moved, lists.searching, zeros(len(bodies), kind=quaternion)
         self.crowded = a.crowded = zeros(1)
-        a.rows, a.cell, a.hardness = zeros(1), zeros(padded), zeros(padded, kind=dtype)
+        a.rows, a.bin, a.bin_end = zeros(1), zeros(n), zeros(_BINS)
+        a.cell, a.hardness = zeros(padded), zeros(padded, kind=dtype)
         a.pose = zeros(padded * capacity * _POSE_ROWS, kind=dtype)
         a.tensor = zeros(padded * capacity * _TENSOR_ROWS, kind=dtype)
         self._locate, self._tabulate = self._record(LOCATE, LOCATE), self._record(CLEAR, TABULATE)
@@ -191,7 +201,7 @@ class CellPairs:
     def _record(self, first: int, last: int) -> list:
         """Return launches of passes ``first`` to ``last``: one on a CPU, one each on a GPU."""
         pairs, device = self._pairs, self._pairs.h.device
-        group, rows = group_threads(device), max(pairs.cell.shape[0], pairs.group.shape[0])
+        group, rows = group_threads(device), max(pairs.cell.shape[0], pairs.group.shape[0], _BINS)
         kernel = _kernel(pairs.packed.dtype, group)
         sizes = dict(threads=threads_for(rows, _CELLS_PER_THREAD), gpu_threads=group * rows)
         ranges = [(k, k + 1) for k in range(first, last + 1)] if device.is_cuda else [(first, last + 1)]

@@ -9,7 +9,7 @@ struct alignas(16) Cell {
     int x, y, z, group; // group −1 stands for no cell
 };
 
-// Positions [m] and radii [m] of packed moments.
+// Positions [m] of packed moments, and radii [m] that determine who is near.
 struct Balls {
     const Real *x, *y, *z, *radius;
 };
@@ -17,7 +17,7 @@ struct Balls {
 template <class Lists> CUDA_CALLABLE inline Balls balls_of(const Lists& lists) {
     const Real* const x = (const Real*)lists.packed.data;
     const size_t pitch = lists.packed.strides[0] / sizeof(Real);
-    return {x, x + pitch, x + 2 * pitch, x + 3 * pitch};
+    return {x, x + pitch, x + 2 * pitch, lists.radius.data};
 }
 
 // Inverse width of a cell. The width exceeds the largest distance of neighbors despite rounding.

@@ -46,6 +46,7 @@ def lists_type(dtype):
         reach: wp.array[wp.float64]  # largest contact distance [m], shape [1]
         # Data in:
         packed: wp.array2d[dtype]
+        radius: wp.array[dtype]  # radii that determine contact distances [m], shape [n]
         moved: wp.array[int]  # 1 if a moment has moved too far since the last search, shape [1]; from ``packing``
         # Data out:
         neighbor: wp.array2d[int]  # ascending indices of neighbors, shape [n, capacity]
@@ -67,15 +68,17 @@ def lists_type(dtype):
     return NeighborLists
 
 
-def allocate(count: int, packed, group, *, reach: float, ratio=1.0 + SKIN, capacity=CAPACITY, bodies=None):
+def allocate(count: int, packed, group, *, reach: float, ratio=1.0 + SKIN, capacity=CAPACITY, radii=None, bodies=None):
     """Allocate empty lists of ``count`` moments; return the struct :func:`lists_type`, which describes the arguments.
 
-    A ``ratio`` of 1 lists overlapping pairs only. Without ``bodies`` each moment is a body.
+    A ``ratio`` of 1 lists overlapping pairs only. None for ``radii`` means those of the packed moments. Without
+    ``bodies`` each moment is a body.
     """
     device, dtype = packed.device, packed.dtype
     linked, padded = (0, count + _PADDING) if device.is_cpu else (count, 0)
     lists = lists_type(dtype)()
     lists.packed, lists.group, lists.ratio = packed, group, ratio
+    lists.radius = packed[3] if radii is None else radii
     lists.body = wp.array(np.arange(count) if bodies is None else bodies, dtype=wp.int32, device=device)
     lists.reach = wp.full(1, reach, dtype=wp.float64, device=device)
     lists.neighbor = (wp.zeros if ratio > 1.0 else wp.empty)((count, capacity), dtype=int, device=device)

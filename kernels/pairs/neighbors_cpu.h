@@ -11,12 +11,13 @@ namespace warpmag {
 
 constexpr int TARGETS = 64; // targets that a thread takes at a time
 
-// Sources in the order of their buckets: index, body, column, group, position and radius. ``begin[b]`` is the first source of
-// bucket b. ``bucket`` has the bucket of each source, or −1, in the original order of sources.
+// Sources in the order of their buckets: index, body, column, group, position and radius. ``begin[b]`` is the first
+// source of bucket b. ``bucket`` has the bucket of each source, or −1, in the original order of sources.
 struct SortedSources {
     int buckets, pitch, *begin, *index;
     Real* x;
-    int *body = index + pitch, *column_x = body + pitch, *column_y = column_x + pitch, *group = column_y + pitch, *bucket = group + pitch;
+    int *body = index + pitch, *column_x = body + pitch, *column_y = column_x + pitch, *group = column_y + pitch,
+        *bucket = group + pitch;
     Real *y = x + pitch, *z = y + pitch, *radius = z + pitch;
 };
 
@@ -101,8 +102,8 @@ inline void search_neighbors(const Lists& targets, const Lists& sources, int thr
     const bool same = targets.count.data == sources.count.data;
     share_items(team, threads, targets.packed.shape[1], TARGETS, [&](int i) {
         int list[CAPACITY + WIDTH];
-        const Target target = {balls.x[i], balls.y[i], balls.z[i], balls.radius[i], (Real)targets.ratio,
-                               same ? targets.body.data[i] : -1};
+        const Target target = {balls.x[i],      balls.y[i],          balls.z[i],
+                               balls.radius[i], (Real)targets.ratio, same ? targets.body.data[i] : -1};
         const int count = find_around(sorted, target, cell_of(balls, i, targets.group.data[i], cells_per_meter), list);
         write_sorted(list, count < CAPACITY ? count : CAPACITY, targets.neighbor.data + (size_t)CAPACITY * i);
         targets.count.data[i] = count;

@@ -94,6 +94,8 @@ class MomentSystem:
         positions: Moment positions [m], shape [n]; written by the caller before :meth:`solve`.
         moments: Moments [A·m²], shape [n]. The caller writes permanent moments, :meth:`solve` inducible moments.
         external_field: Applied field [A/m], shape [n]; the caller may change it.
+        crowded: 1 if some cells have too many neighbors in other bodies, so that they act as balls, shape [1]; None
+            unless a world has several bodies of ``couplings``.
         rotations: Rotation of each body of ``couplings`` from its frame to the world's (x, y, z, w), shape [bodies];
             written by the caller before :meth:`solve`. None without ``couplings``.
         sources: ``sources`` and ``solids`` on the device; the caller writes their poses and strengths before
@@ -225,7 +227,7 @@ class MomentSystem:
 
     def _make_cells(self, layout: MomentLayout, couplings, responses: bool):
         """Prepare the corrections between cells; ``responses`` is True if small bodies respond collectively."""
-        self._cells = self._cell_pairs = self.rotations = None
+        self._cells = self._cell_pairs = self.rotations = self.crowded = None
         if couplings:
             collective = [responses and len(coupling.radii) <= MOST_CELLS for _, coupling in couplings]
             several = np.bincount(layout.worlds[[first for first, _ in couplings]]).max() > 1
@@ -242,6 +244,7 @@ class MomentSystem:
                     couplings, self.rotations, layout.worlds, layout.movable, self._packed, self.moments, self.h,
                     self.forces, self.torques,
                 )  # fmt: skip
+                self.crowded = self._cell_pairs.crowded
 
     def _make_responses(self, layout: MomentLayout, couplings) -> BodyResponses | None:
         """Prepare the collective response of bodies of few cells."""

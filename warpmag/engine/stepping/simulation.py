@@ -261,6 +261,8 @@ class Simulation:
         error, rtol = self._statistics.field_error, self._magnetics.rtol
         if error > rtol:
             lines.append(f"fields by multipoles have an error of {error:.2g} > rtol {rtol:g}; use method direct")
+        if (crowded := self._magnetics.system.crowded) is not None and crowded.numpy()[0]:
+            lines.append("some cells of inducible bodies intersect too many others, and acted on these as balls")
         return lines
 
     @property
