@@ -58,11 +58,11 @@ def fade(distance: float, window: tuple[float, float]) -> float:
 
 
 def pair_correction(a, b, window, close) -> np.ndarray:
-    """Tensor of a pair of boxes less that of balls of their volumes [1/m³], shape [3, 3].
+    """Tensor of two boxes less that of balls of their volumes [1/m³], shape [3, 3], for bodies of equal cells.
 
     Args:
         a, b: Boxes: position [m], rotation matrix, half sides [m].
-        window, close: Windows of all boxes and of boxes integrated over, in mean sizes.
+        window, close: Windows of all boxes, in mean sizes, and of boxes integrated over, in mean longest sides.
     """
     (x, turn, half), (y, other_turn, other_half) = a, b
     r, d = x - y, np.linalg.norm(x - y)
@@ -72,13 +72,15 @@ def pair_correction(a, b, window, close) -> np.ndarray:
     if distance >= window[1]:
         return np.zeros((3, 3))
 
-    of_b = other_turn @ mean_tensor(other_turn.T @ r, other_turn.T @ turn, other_half, half) @ other_turn.T
-    of_a = turn @ mean_tensor(-turn.T @ r, turn.T @ other_turn, half, other_half) @ turn.T
+    if half.prod() <= other_half.prod() * 1.0005:
+        of_larger = other_turn @ mean_tensor(other_turn.T @ r, other_turn.T @ turn, other_half, half) @ other_turn.T
+    else:
+        of_larger = turn @ mean_tensor(-turn.T @ r, turn.T @ other_turn, half, other_half) @ turn.T
     spread = turn @ np.diag(half**2 / 3.0) @ turn.T + other_turn @ np.diag(other_half**2 / 3.0) @ other_turn.T
     g1, g2, _ = oracle.radial_factors(np.array([d]), radii[0], radii[1])
     ball = (g1[0] * np.eye(3) + g2[0] * np.outer(r, r)) / (4.0 * np.pi)
-    near = fade(distance, close)
-    tensor = near * (0.5 * (of_a + of_b) - ball) + (1.0 - near) * quadrupole_tensor(r, spread)
+    near = fade(d / (half.max() + other_half.max()), close)
+    tensor = near * (of_larger - ball) + (1.0 - near) * quadrupole_tensor(r, spread)
     return fade(distance, window) * tensor
 
 

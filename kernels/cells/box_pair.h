@@ -1,9 +1,9 @@
 // Tensor and forces of a pair of magnetized boxes, less those of balls of the same volumes, in the frame of box i.
 //
-// The tensor of close boxes is the field of each box, averaged over 2³ Gauss points of the other one, and the mean of
-// both, so that it is symmetric. Those farther away differ from balls by their quadrupoles. A window ends this
-// difference. Forces are the exact derivatives of the energy −μ0 m_i·T_ij·m_j, so that they conserve energy and
-// momentum. Lengths are in units of the mean of the boxes' sizes.
+// The tensor of close boxes is the field of the larger box, averaged over 2³ Gauss points of the smaller one. Those
+// farther away differ from balls by their quadrupoles. A window ends this difference. Forces are the exact derivatives
+// of the energy −μ0 m_i·T_ij·m_j, so that they conserve energy and momentum. Lengths are in units of the mean of the
+// boxes' sizes.
 //
 // From Python: WINDOW_BEGIN, WINDOW_END, CLOSE_BEGIN and CLOSE_END, distances of the windows.
 #pragma once
@@ -12,6 +12,8 @@
 #include "pairs/pair_law.h"
 
 namespace warpmag {
+
+constexpr Real SMALLER = Real(0.999); // ratio of volumes from which a box counts as smaller than another one
 
 // Boxes of cells: half sides, rotation to the world as quaternion, volume, and the size that scales the window.
 struct Boxes {
@@ -42,17 +44,23 @@ CUDA_CALLABLE inline Window window_between(Number d, Real begin, Real end, Mask 
 }
 
 // A pair of boxes in units of ``1/unit``: half sides, separation r from i to j, rotation of j in the frame of i, radii
-// of the balls, the window of all boxes, and that of boxes that are integrated over.
+// of the balls, the window of all boxes, and that of close boxes. ``own_points``: the Gauss points are those of i.
 struct BoxPair {
     Vector half, other_half, r;
     Rotation<Number> rotation;
     Number unit, radius, other_radius;
     Window window, close;
+    Mask own_points;
 };
-CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, const RelativePose& pose, Mask listed) {
-    const Number unit = 2 / (own.size + other.size);
+CUDA_CALLABLE inline Number longest(Vector half) { return larger(half.x, larger(half.y, half.z)); }
+CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, const RelativePose& pose, Mask listed,
+                                      Mask own_first) {
+    const Number unit = 2 / (own.size + other.size), side = unit * (longest(own.half) + longest(other.half));
     const Vector r = unit * pose.r;
     const Number d = length(r);
+    Window close = window_between(d / side, CLOSE_BEGIN, CLOSE_END, listed);
+    close.slope /= side;
+    const Mask own_smaller = own.volume < SMALLER * other.volume, alike = own.volume * SMALLER <= other.volume;
     return {unit * own.half,
             unit * other.half,
             r,
@@ -61,7 +69,8 @@ CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, cons
             unit * own.radius,
             unit * other.radius,
             window_between(d, WINDOW_BEGIN, WINDOW_END, listed),
-            window_between(d, CLOSE_BEGIN, CLOSE_END, listed)};
+            close,
+            own_smaller | (own_first & alike)};
 }
 
 // Calls visit(p) for 2³ Gauss points of a box of half sides h, which have equal weights.
@@ -105,18 +114,44 @@ CUDA_CALLABLE inline BallLaw ball_law(const BoxPair& p) {
     return {at.u, d, g};
 }
 
-// Mean of both boxes' fields, each averaged over the Gauss points of the other box, in the frame of i.
+// A source, the box whose field is evaluated, and a target, the box with the Gauss points, in the frame of the source.
+struct SourceAndTarget {
+    Vector half, target_half, center; // half sides, and the target's center
+    Rotation<Number> rotation;        // from the frame of the target to that of the source
+    Number scale;                     // weight of a point, over the source's volume
+
+    CUDA_CALLABLE explicit SourceAndTarget(const BoxPair& p) {
+        const Mask own = p.own_points;
+        half = choose(own, p.other_half, p.half);
+        target_half = choose(own, p.half, p.other_half);
+        center = choose(own, -to_body(p.rotation, p.r), p.r);
+        for (int k = 0; k < 3; ++k)
+            for (int l = 0; l < 3; ++l) rotation.rows[k][l] = own ? p.rotation.rows[l][k] : p.rotation.rows[k][l];
+        scale = Real(1.0 / 64) / (half.x * half.y * half.z);
+    }
+    // A vector of the frame of i in that of the source, and back.
+    static CUDA_CALLABLE Vector to_source(const BoxPair& p, Vector a) {
+        return choose(p.own_points, to_body(p.rotation, a), a);
+    }
+    static CUDA_CALLABLE Vector from_source(const BoxPair& p, Vector a) {
+        return choose(p.own_points, to_world(p.rotation, a), a);
+    }
+    static CUDA_CALLABLE Vector choose(Mask first, Vector a, Vector b) {
+        return {first ? a.x : b.x, first ? a.y : b.y, first ? a.z : b.z};
+    }
+};
+
+// Field tensor of the source, averaged over the Gauss points of the target, in the frame of i.
 CUDA_CALLABLE inline Symmetric boxes_tensor(const BoxPair& p) {
-    const Number zero = p.unit * Real(0),
-                 share = zero + Real(1.0 / 128); // 8 points, volumes 8 h_x h_y h_z, mean of two
-    Symmetric of_other = {zero, zero, zero, zero, zero, zero}, of_own = of_other;
-    for_gauss_points(p.half, [&](Vector x) {
-        of_other = of_other + box_tensor(view_box(to_body(p.rotation, x - p.r), p.other_half));
-    });
-    for_gauss_points(p.other_half,
-                     [&](Vector x) { of_own = of_own + box_tensor(view_box(p.r + to_world(p.rotation, x), p.half)); });
-    const Vector a = p.half, b = p.other_half;
-    return share / (b.x * b.y * b.z) * rotated(p.rotation, of_other) + share / (a.x * a.y * a.z) * of_own;
+    const SourceAndTarget s(p);
+    const Number zero = p.unit * Real(0);
+    Symmetric sum = {zero, zero, zero, zero, zero, zero};
+    for_gauss_points(s.target_half,
+                     [&](Vector x) { sum = sum + box_tensor(view_box(s.center + to_world(s.rotation, x), s.half)); });
+    const Symmetric t = s.scale * sum, turned = rotated(p.rotation, t);
+    const Mask own = p.own_points;
+    return {own ? turned.xx : t.xx, own ? turned.yy : t.yy, own ? turned.zz : t.zz,
+            own ? turned.xy : t.xy, own ? turned.yz : t.yz, own ? turned.zx : t.zx};
 }
 
 // Quadrupoles of a pair: the traceless mean of x xᵀ over box i, along its axes, the sum Q of both in the frame of i,
@@ -197,27 +232,23 @@ struct Wrench {
 
 // Wrench of m·T e, for T of ``boxes_tensor`` and moments m of i and e of j, in the frame of i.
 CUDA_CALLABLE inline Wrench boxes_wrench(const BoxPair& p, Vector m, Vector e) {
-    const Number zero = p.unit * Real(0), share = zero + Real(1.0 / 128);
-    const Vector a = p.half, b = p.other_half, none = {zero, zero, zero};
-    Wrench of_other = {none, none, zero}, of_own = of_other;
-    const Vector r_j = to_body(p.rotation, p.r), m_j = to_body(p.rotation, m), e_j = to_body(p.rotation, e);
-    for_gauss_points(p.half, [&](Vector x) { // points of i in the field of j, in the frame of j
-        const Vector arm = to_body(p.rotation, x);
-        const BoxView view = view_box(arm - r_j, p.other_half);
-        const Vector force = box_slope(view, e_j, m_j), field = box_tensor(view) * e_j;
-        of_other.add(zero + 1, {force, cross(arm, force) + cross(m_j, field), dot(m_j, field)});
+    const SourceAndTarget s(p);
+    const Number zero = p.unit * Real(0);
+    const Vector m_s = s.to_source(p, m), e_s = s.to_source(p, e);
+    const Vector of_target = s.choose(p.own_points, m_s, e_s), of_source = s.choose(p.own_points, e_s, m_s);
+    Vector force = {zero, zero, zero}, torque = force; // on the target, about the center of the source
+    Number work = zero;
+    for_gauss_points(s.target_half, [&](Vector x) {
+        const Vector at = s.center + to_world(s.rotation, x);
+        const BoxView view = view_box(at, s.half);
+        const Vector push = box_slope(view, of_source, of_target), field = box_tensor(view) * of_source;
+        force += push;
+        torque += cross(at, push) + cross(of_target, field);
+        work += dot(of_target, field);
     });
-    for_gauss_points(p.other_half, [&](Vector x) { // points of j in the field of i
-        const Vector at = p.r + to_world(p.rotation, x);
-        const BoxView view = view_box(at, p.half);
-        const Vector force = box_slope(view, m, e), field = box_tensor(view) * m;
-        of_own.add(zero - 1, {force, cross(at, force) + cross(e, field), -dot(e, field)});
-    });
-    Wrench sum = {none, none, zero};
-    sum.add(share / (a.x * a.y * a.z), of_own);
-    const Wrench turned = {to_world(p.rotation, of_other.force), to_world(p.rotation, of_other.torque), of_other.work};
-    sum.add(share / (b.x * b.y * b.z), turned);
-    return sum;
+    const Vector about_target = torque - cross(s.center, force);
+    const Vector on_i = s.choose(p.own_points, force, -force), turning = s.choose(p.own_points, about_target, -torque);
+    return {s.scale * s.from_source(p, on_i), s.scale * s.from_source(p, turning), s.scale * work};
 }
 
 // Wrench of m·T e, for T of ``quadrupole_tensor``. The torque has a share of the quadrupole of i, which turns with it.

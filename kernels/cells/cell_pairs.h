@@ -15,7 +15,7 @@
 namespace warpmag {
 
 constexpr int TENSOR_ROWS = 6, POSE_ROWS = 7; // xx, yy, zz, xy, yz, zx; position and quaternion of box j
-constexpr Real POSE_TOLERANCE = Real(1e-6);   // largest change of a pose that counts as rest: float32 rounding
+constexpr Real POSE_TOLERANCE = Real(3e-5);   // largest change of a pose, in sizes, that counts as rest
 
 constexpr int BINS = 64; // of rows by their number of close candidates; as in cell_pairs.py
 
@@ -48,29 +48,24 @@ CUDA_CALLABLE inline int increment(int* count) {
 #endif
 }
 
-// Orders the candidates of cell i by distance, and returns the number of those that may be close.
-template <class Pairs> CUDA_CALLABLE inline int sort_candidates(const Pairs& a, int i, int count) {
+// Puts the candidates of cell i that may be close before all others, and returns their number.
+template <class Pairs> CUDA_CALLABLE inline int part_candidates(const Pairs& a, int i, int count) {
     const Real* const x = (const Real*)a.packed.data;
-    const size_t pitch = a.packed.strides[0] / sizeof(Real);
-    const Real* const size = a.half.data + 3 * (size_t)a.half.shape[1];
+    const size_t pitch = a.packed.strides[0] / sizeof(Real), cells = a.half.shape[1];
     int* const list = a.candidate.data + (size_t)i * a.candidate.shape[1];
-    auto square = [=](int j) {
-        const Real r[3] = {x[j] - x[i], x[j + pitch] - x[i + pitch], x[j + 2 * pitch] - x[i + 2 * pitch]};
-        return r[0] * r[0] + r[1] * r[1] + r[2] * r[2];
+    auto longest_half = [&](int j) {
+        const Real* const half = a.half.data + j;
+        return larger(half[0], larger(half[cells], half[2 * cells]));
     };
+    const Real own_half = longest_half(i);
     int close = 0;
     for (int k = 0; k < count; ++k) {
         const int j = list[k];
-        const Real d = square(j), reach = (CLOSE_END + MARGIN) / 2 * (size[i] + size[j]);
-        close += d < reach * reach;
-        int place = k;
-        for (; place > 0; --place) {
-            const int other = list[place - 1];
-            const Real at = square(other);
-            if (at < d || (at == d && other < j)) break;
-            list[place] = other;
-        }
-        list[place] = j;
+        const Real r[3] = {x[j] - x[i], x[j + pitch] - x[i + pitch], x[j + 2 * pitch] - x[i + 2 * pitch]};
+        const Real reach = (CLOSE_END + MARGIN) * (own_half + longest_half(j));
+        if (!(r[0] * r[0] + r[1] * r[1] + r[2] * r[2] < reach * reach)) continue;
+        list[k] = list[close];
+        list[close++] = j;
     }
     return close;
 }
@@ -81,7 +76,7 @@ template <class Pairs> CUDA_CALLABLE inline void select(const Pairs& a, int i) {
     const int count = a.group.data[i] < 0 ? 0 : a.candidate_count.data[i];
     if (count > a.candidate.shape[1]) raise_flag(*a.crowded.data);
     if (count == 0 || count > a.candidate.shape[1]) return;
-    const int close = sort_candidates(a, i, count);
+    const int close = part_candidates(a, i, count);
     a.bin.data[i] = close < BINS ? BINS - 1 - close : 0;
     increment(a.bin_end.data + a.bin.data[i]);
 }
@@ -110,6 +105,11 @@ template <class Pairs> CUDA_CALLABLE inline void place(const Pairs& a, int i) {
 struct Cells {
     int at[WIDTH];
 };
+
+// True where a cell has a smaller index than its candidate.
+CUDA_CALLABLE inline Mask precedes(const Cells& own, const Cells& other) {
+    return mask_of(indices(own.at) < indices(other.at));
+}
 
 template <class Pairs> struct PairReader {
     const Pairs& a;
@@ -206,7 +206,7 @@ template <class Pairs> CUDA_CALLABLE inline void tabulate(const Pairs& a, int ro
         const RelativePose pose = relative_pose(apart, box, other_box);
         const Mask moved = store_pose(slot_at(a.pose.data, reader.capacity, POSE_ROWS, slot, row), pose, box.size);
         if (!any(moved)) continue;
-        const BoxPair pair = box_pair(box, other_box, pose, listed);
+        const BoxPair pair = box_pair(box, other_box, pose, listed, precedes(own, other));
         const Mask near = pair.window.value > Real(0);
         const Number zero = pair.unit * Real(0), cube = pair.unit * pair.unit * pair.unit;
         Symmetric tensor = {zero, zero, zero, zero, zero, zero};
@@ -268,7 +268,8 @@ template <class Pairs> CUDA_CALLABLE inline void add_force(const Pairs& a, int r
         const Cells other = reader.candidates(own, counts, slot);
         const Boxes other_box = reader.boxes(other);
         const RelativePose pose = relative_pose(reader.position(other) - x, box, other_box);
-        const BoxPair pair = box_pair(box, other_box, pose, mask_of(indices(own.at) != indices(other.at)));
+        const Mask listed = mask_of(indices(own.at) != indices(other.at));
+        const BoxPair pair = box_pair(box, other_box, pose, listed, precedes(own, other));
         const Mask near = pair.window.value > Real(0);
         if (!any(near)) continue;
         const Number cube = pair.unit * pair.unit * pair.unit;

@@ -23,12 +23,13 @@ from warpmag.kernels.shared.team import launch_passes, threads_for
 
 WINDOW = 2.5, 3.5
 """Distances at which boxes start to turn into balls and are balls, in means of their sizes: the longest side times the
-root of its ratio to the shortest. Dipoles lack the quadrupole of flat cells, and need more distance."""
+root of its ratio to the shortest, less for small cells. Dipoles lack the quadrupole of flat
+cells, and need more distance."""
 _FLATTEST = 2.5
 """Largest ratio of sides that increases a size, that of whole cells at automatic spacing. Flatter cells are parts that
 a surface cuts off, of little volume."""
 CLOSE = 1.75, 2.25
-"""Distances at which the average over close boxes turns into their quadrupoles, in the same unit."""
+"""Distances at which the average over close boxes turns into their quadrupoles, in means of their longest sides."""
 HARDENING = 0.3
 """Demagnetizing factor added to a cell inside another body. Quadrature over intersecting boxes leaves eigenvalues of
 -0.05."""
@@ -38,7 +39,7 @@ _SHORTEST_LIST = 64
 """Shortest list of candidates."""
 _SAMPLES = 32
 """Points whose neighbors are counted for the length of the lists."""
-_MARGIN = 0.2
+_MARGIN = 0.5
 """Part of half its size that a cell may move before candidates are searched again."""
 LOCATE, CLEAR, SELECT, ARRANGE, PLACE, TABULATE, ADD_FIELD, ADD_FORCE = range(8)
 """The passes, in order; as in ``cell_pairs.h``."""
@@ -114,6 +115,12 @@ def _kernel(dtype, group: int):
     )
 
 
+def _volume_factors(half_sides) -> np.ndarray:
+    """Return (V/V_max)^⅕ for half sides of the boxes of a body, shape [3, cells]: quadrupole fields fall as V/r⁵."""
+    volumes = half_sides.prod(axis=0)
+    return (volumes / volumes.max()) ** 0.2
+
+
 def _list_length(bodies, group, reach: float) -> int:
     """Return the length of lists for candidates up to ``reach`` [m]: all bodies of a world around a cell, or a solid.
 
@@ -168,7 +175,7 @@ class CellPairs:
             sides = coupling.half_sides.T
             group[cells], body[cells], half[:3, cells] = worlds[cells], number, sides
             most, least = sides.max(axis=0), sides.min(axis=0)
-            half[3, cells] = 2.0 * most * np.sqrt(np.minimum(most / least, _FLATTEST))
+            half[3, cells] = 2.0 * most * np.sqrt(np.minimum(most / least, _FLATTEST)) * _volume_factors(sides)
         ratio, reach = WINDOW[1] + _MARGIN, float(half[3, group >= 0].max())
         capacity = _list_length(bodies, group, ratio * reach)
         padded = -(-int((group >= 0).sum()) // CHUNK) * CHUNK
