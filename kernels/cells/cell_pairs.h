@@ -17,7 +17,7 @@ namespace warpmag {
 constexpr int TENSOR_ROWS = 6, POSE_ROWS = 7; // xx, yy, zz, xy, yz, zx; position and quaternion of box j
 constexpr Real POSE_TOLERANCE = Real(3e-5);   // largest change of a pose, in sizes, that counts as rest
 
-constexpr int BINS = 64; // of rows by their number of close candidates; as in cell_pairs.py
+constexpr int CLASSES = 16, BINS = CLASSES * CLASSES; // of rows by their numbers of close and of all candidates
 
 enum CellPairPass { LOCATE, CLEAR, SELECT, ARRANGE, PLACE, TABULATE, ADD_FIELD, ADD_FORCE }; // as in cell_pairs.py
 
@@ -70,6 +70,9 @@ template <class Pairs> CUDA_CALLABLE inline int part_candidates(const Pairs& a, 
     return close;
 }
 
+// Class of a number of candidates: class 0 has the largest numbers.
+CUDA_CALLABLE inline int class_of(int number) { return number < CLASSES ? CLASSES - 1 - number : 0; }
+
 // Prepares cell i for a row after a search, if it has candidates. Cells with too many candidates have none.
 template <class Pairs> CUDA_CALLABLE inline void select(const Pairs& a, int i) {
     a.bin.data[i] = -1;
@@ -77,11 +80,11 @@ template <class Pairs> CUDA_CALLABLE inline void select(const Pairs& a, int i) {
     if (count > a.candidate.shape[1]) raise_flag(*a.crowded.data);
     if (count == 0 || count > a.candidate.shape[1]) return;
     const int close = part_candidates(a, i, count);
-    a.bin.data[i] = close < BINS ? BINS - 1 - close : 0;
+    a.bin.data[i] = CLASSES * class_of((close + 1) / 2) + class_of(count / 16);
     increment(a.bin_end.data + a.bin.data[i]);
 }
 
-// Makes the counts of the bins their first rows. Rows of a vector then have similar numbers of close candidates.
+// Makes the counts of the bins their first rows. Rows of a vector then have similar numbers of candidates.
 template <class Pairs> CUDA_CALLABLE inline void arrange(const Pairs& a) {
     int rows = 0;
     for (int k = 0; k < BINS; ++k) {

@@ -45,8 +45,8 @@ LOCATE, CLEAR, SELECT, ARRANGE, PLACE, TABULATE, ADD_FIELD, ADD_FORCE = range(8)
 """The passes, in order; as in ``cell_pairs.h``."""
 _TENSOR_ROWS, _POSE_ROWS = 6, 7
 """Numbers of a tensor and of a relative pose; as in ``cell_pairs.h``."""
-_BINS = 64
-"""Bins of rows by their number of close candidates; as in ``cell_pairs.h``."""
+_BINS = 256
+"""Bins of rows by their numbers of candidates; as in ``cell_pairs.h``."""
 _CELLS_PER_THREAD = 100
 """Fewest cells per thread of a CPU."""
 
@@ -81,7 +81,7 @@ def cell_pairs_type(dtype):
         moved: wp.array[int]  # 1 if a cell has moved too far since then, shape [1]
         searching: wp.array[int]  # nonzero if the last search rebuilt the lists, shape [1]
         rows: wp.array[int]  # number of rows, shape [1]
-        bin: wp.array[int]  # bin of each moment by its number of close candidates, −1 for no row, shape [n]
+        bin: wp.array[int]  # bin of each moment by its numbers of candidates, −1 for no row, shape [n]
         bin_end: wp.array[int]  # end of each bin's rows, shape [BINS]
         cell: wp.array[int]  # cell of each row, shape [c padded]
         pose: wp.array[dtype]  # relative pose of each tensor, shape [c padded / CHUNK, capacity, 7, CHUNK], flat
