@@ -66,7 +66,7 @@ def pair_correction(a, b, window, close) -> np.ndarray:
     """
     (x, turn, half), (y, other_turn, other_half) = a, b
     r, d = x - y, np.linalg.norm(x - y)
-    sizes = [2.0 * h.max() * np.sqrt(min(h.max() / h.min(), 2.5)) for h in (half, other_half)]
+    sizes = [2.0 * h.max() * np.sqrt(min(h.max() / h.min(), 3.0)) for h in (half, other_half)]
     radii = [np.cbrt(8.0 * h.prod() * 0.75 / np.pi) for h in (half, other_half)]
     distance = d / np.mean(sizes)
     if distance >= window[1]:

@@ -25,7 +25,7 @@ WINDOW = 2.5, 3.5
 """Distances at which boxes start to turn into balls and are balls, in means of their sizes: the longest side times the
 root of its ratio to the shortest, less for small cells. Dipoles lack the quadrupole of flat
 cells, and need more distance."""
-_FLATTEST = 2.5
+_FLATTEST = 3.0
 """Largest ratio of sides that increases a size, that of whole cells at automatic spacing. Flatter cells are parts that
 a surface cuts off, of little volume."""
 CLOSE = 1.75, 2.25
