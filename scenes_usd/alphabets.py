@@ -88,7 +88,8 @@ def author(
         body.GetInherits().AddInherit(_class_of(letter))
         UsdPhysics.MassAPI.Apply(body).CreateMassAttr(authoring.IRON_DENSITY * shapes[letter][1])
         UsdShade.MaterialBindingAPI.Apply(body).Bind(paints[number % len(paints)])
-        author_magnet(body, Magnet(moment_spacing=moment_spacing, saturation=saturation))
+        # the curve is the paper's Eq. 10
+        author_magnet(body, Magnet(moment_spacing=moment_spacing, saturation=saturation, curve="tanh-applied"))
     _add_center(stage, moment, core)
     reach = 0.5 * float(np.linalg.norm(pitch * (columns, layers, rows)))
     authoring.add_camera(stage, (1.5 * reach, -3.8 * reach, 0.9 * reach), (0.0, 0.0, 0.0))

@@ -160,7 +160,7 @@ def test_runs_of_moments_are_those_of_each_world_by_itself():
             ranges.append((first, middle, last))
             edges = np.flatnonzero(np.diff([0, *wanted[first:last].astype(int), 0])).reshape(-1, 2) + first
             runs += [(int(begin), int(end), first, last) for begin, end in edges]
-        layout = MomentLayout(np.zeros(count), worlds, permanent, worlds, wanted, wanted, wanted)
+        layout = MomentLayout(np.zeros(count), worlds, permanent, worlds, wanted, wanted, ~wanted, wanted)
         assert layout.ranges() == ranges
         assert layout.runs(wanted) == runs
 

@@ -32,6 +32,7 @@ class Scene:
         self.couplings = [(int(k), COUPLINGS[id(body)]) for k, body in zip(self.first, bodies, strict=True)]
         labels = np.append(np.repeat(np.arange(len(bodies)), counts), len(bodies) + np.arange(len(self.balls)))
         self.settings = {"bodies": labels, "radii": self.radii, "saturation": MS, "couplings": self.couplings}
+        self.settings["curve"] = "tanh-applied"  # the oracle's
         self.settings |= settings
 
     def system(self, **settings):

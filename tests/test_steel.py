@@ -83,11 +83,11 @@ def test_kernels_follow_the_table(name, dtype, device):
     @wp.kernel(module="unique", enable_backward=False, module_options=native_options("material/curves.h", dtype=kind))
     def evaluate(tables: wp.array2d[kind], s: wp.array[kind], c: wp.array[kind], out: wp.array2d[wp.float64]):
         i = wp.tid()
-        curve = wp.static(kernel_curves.FIRST_TABLE)
-        out[0, i] = wp.float64(kernel_curves.curve_ratio(s[i], curve, tables))
-        out[1, i] = wp.float64(kernel_curves.curve_slope(s[i], curve, tables))
-        out[2, i] = wp.float64(kernel_curves.inverse_curve_ratio(c[i], curve, tables))
-        out[3, i] = kernel_curves.curve_area(s[i], curve, tables)
+        curve, k = wp.static(kernel_curves.FIRST_TABLE), kind(3.0)  # the rows of a table contain k
+        out[0, i] = wp.float64(kernel_curves.curve_ratio(s[i], k, curve, tables))
+        out[1, i] = wp.float64(kernel_curves.curve_slope(s[i], k, curve, tables))
+        out[2, i] = wp.float64(kernel_curves.inverse_curve_ratio(c[i], k, curve, tables))
+        out[3, i] = kernel_curves.curve_area(s[i], k, curve, tables)
 
     tables = kernel_curves.curve_tables([curve], kind, device)
     given = [wp.array(x, dtype=kind, device=device) for x in (s, c)]

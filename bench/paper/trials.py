@@ -26,6 +26,7 @@ _CORES = 2  # cores of a trial on a CPU
 _AS_PUBLISHED = {"balls_up": {"conductivity": 0.0}}  # parameters that remove features beyond the paper's method
 _FIGURES = "magnets held held_rms_speed held_median_speed rms_speed peak_speed overlap farthest".split()
 """Statistics of a run that are reported."""
+_CURVES = {"tanh": "tanh-applied"}  # the paper's Eq. 10 for the letters of every method
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,8 @@ def _load(trial: Trial, folder: Path) -> warpmag.Simulation:
         stage = folder / f"{trial.scene}.usdc"
         import_module(f"warpmag.scenes_usd.{trial.scene}").author(stage, **parameters)
     settings = {"rtol": trial.rtol, "max_evaluations": trial.max_evaluations, "device": trial.device}
-    settings |= {"dynamics": method.dynamics, "curve": method.curve, "force": trial.force or method.force}
+    settings |= {"dynamics": method.dynamics, "force": trial.force or method.force}
+    settings["curve"] = _CURVES.get(method.curve, method.curve)
     with mock.patch.object(dynamics, "STEP", trial.pair_step):  # scenes have no attribute for it
         return warpmag.Simulation(stage, **settings)
 

@@ -165,7 +165,7 @@ def reduced_curve(s, curve):
     s = np.asarray(s, float)
     if callable(curve):
         return curve(s)
-    if curve == "tanh":  # Eq. 10
+    if curve in ("tanh", "tanh-applied"):  # Eq. 10
         return np.tanh(s), 1.0 / np.cosh(np.minimum(s, 300.0)) ** 2
     if curve == "clamped":  # Eq. 7
         return np.minimum(s, 1.0), np.where(s < 1.0, 1.0, 0.0)
@@ -180,7 +180,28 @@ def reduced_curve(s, curve):
             value = 1.0 / np.tanh(y) - 1.0 / y
             slope = 1.0 / y**2 - 1.0 / np.sinh(np.minimum(y, 300.0)) ** 2
         return np.where(x < 0.1, small, value), 3.0 * np.where(x < 0.1, dsmall, slope)
-    raise ValueError(f"curve: {curve!r} is not one of tanh, langevin, clamped, frohlich")
+    raise ValueError(f"curve: {curve!r} is not one of tanh, langevin, clamped, frohlich, tanh-applied")
+
+
+def inner_curve(curve, susceptibility):
+    """Curve of a cell as a function for :func:`reduced_curve`: M is ``curve`` in the field H − M/3 inside.
+
+    M = Ms c(y), y = χ H'/Ms with the field H' inside, so that s = k H/Ms = (k/χ) y + (k/3) c(y), solved by bisection.
+    """
+    if math.isinf(susceptibility):
+        return lambda s: reduced_curve(s, "clamped")
+    k = float(curve_slope(susceptibility))
+
+    def of_reduced_field(s):
+        low, high = np.zeros_like(s), s * susceptibility / k
+        for _ in range(200):
+            y = 0.5 * (low + high)
+            above = k / susceptibility * y + k / 3.0 * reduced_curve(y, curve)[0] > s
+            low, high = np.where(above, low, y), np.where(above, y, high)
+        value, slope = reduced_curve(0.5 * (low + high), curve)
+        return value, slope / (k / susceptibility + k / 3.0 * slope)
+
+    return of_reduced_field
 
 
 def magnetization(h, saturation, susceptibility=math.inf, curve="tanh"):

@@ -150,7 +150,7 @@ def _eddy_kernel(dtype):
         if arrays.inducible[i] == 1:
             slope, saturation, curve = arrays.slope[i], arrays.saturation[i], arrays.curve[i]
             s = slope * wp.length(h) / saturation
-            steepest = wp.max(curve_ratio(s, curve, arrays.tables), curve_slope(s, curve, arrays.tables))
+            steepest = wp.max(curve_ratio(s, slope, curve, arrays.tables), curve_slope(s, slope, curve, arrays.tables))
             largest = dtype(1.0) + two_thirds * slope * steepest
             k *= largest * largest
             for _ in range(2):

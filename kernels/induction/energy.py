@@ -48,7 +48,7 @@ def _energy_kernel(dtype):
         i = wp.tid()
         half = wp.float64(0.5)
         if inducible[i] != 0:
-            area = curve_area(slope[i] * wp.length(h[i]) / saturation[i], curve[i], tables)
+            area = curve_area(slope[i] * wp.length(h[i]) / saturation[i], slope[i], curve[i], tables)
             unit = wp.float64(saturation[i]) * wp.float64(saturation[i]) / wp.float64(slope[i])
             volume = wp.float64(ball_volume(radii[i]))
             e = half * product(moments[i], h[i] - h0[i]) - volume * unit * area

@@ -38,7 +38,7 @@ LAW_IDS = {"theta-euler": THETA_EULER, "llg": LLG, "llg-damping": LLG_DAMPING}
 @wp.func
 def effective_field(h: Any, m: Any, slope: Any, curve: int, tables: Any):
     """Return the reduced effective field H_eff/Ms (Eqs. 5, 11) of reduced field ``h`` and magnetization ``m``."""
-    return h - (inverse_curve_ratio(wp.length(m), curve, tables) / slope) * m
+    return h - (inverse_curve_ratio(wp.length(m), slope, curve, tables) / slope) * m
 
 
 @wp.func
@@ -186,7 +186,7 @@ def _convergence_kernel(dtype):
             i = state.row[row][0]
             limit = state.saturation[i]
             g = (state.slope[i] / limit) * state.h[i]
-            goal = (limit * curve_ratio(wp.length(g), state.curve[i], state.curve_tables)) * g
+            goal = (limit * curve_ratio(wp.length(g), state.slope[i], state.curve[i], state.curve_tables)) * g
             # lengths, not squares: the square of 1e-20 A/m underflows float32
             deviation = wp.float64(wp.length(goal - (dtype(0.5) * limit) * (pairs.first[i] + pairs.second[i])))
             terms += wp.vec2d(deviation * deviation, wp.float64(wp.length(goal)) * wp.float64(wp.length(goal)))

@@ -70,8 +70,9 @@ CUDA_CALLABLE inline Number induced_share(const Material& material) {
     return material.curves.common == LINEAR ? material.slope : full;
 }
 template <class State> CUDA_CALLABLE inline Material material_of(const State& state, const Span& at) {
-    return {numbers_or(entries(state.saturation, at), at.count, 1), numbers_or(entries(state.slope, at), at.count, 1),
-            curves_of(state.curve.data, state.common_curve, state.curve_tables.data, at.i, at.count)};
+    const Number slope = numbers_or(entries(state.slope, at), at.count, 1);
+    return {numbers_or(entries(state.saturation, at), at.count, 1), slope,
+            curves_of(state.curve.data, state.common_curve, state.curve_tables.data, slope, at.i, at.count)};
 }
 
 // Positions and radii [m].

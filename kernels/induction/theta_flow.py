@@ -165,9 +165,10 @@ def _set_kernel(dtype):
     @wp.kernel(module="unique", enable_backward=False, module_options=native_options("material/curves.h", dtype=dtype))
     def set_state(magnetizations: wp.array[wp.types.vector(3, dtype)], state: state_struct):
         row = state.row[wp.tid()]
-        reduced = magnetizations[row[0]] / state.saturation[row[0]]
-        ratio = inverse_curve_ratio(wp.length(reduced), state.curve[row[0]], state.curve_tables)
-        state.s[row[0]] = ratio * reduced
+        i = row[0]
+        reduced = magnetizations[i] / state.saturation[i]
+        ratio = inverse_curve_ratio(wp.length(reduced), state.slope[i], state.curve[i], state.curve_tables)
+        state.s[i] = ratio * reduced
         state.warm[row[1]] = 1
 
     return set_state

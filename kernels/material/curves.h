@@ -1,14 +1,16 @@
 // Magnetization curves in reduced form (Kim and Han 2022, Eqs. 7, 10); curves.py lists them and their ids.
 //
-// The functions are templates of the number type: ``Real`` in a Warp function, ``Number`` in a pass over moments. The
-// functions at the end accept both curves with a formula and measured curves (tables.h).
+// The functions are templates of the number type: ``Real`` in a Warp function, ``Number`` in a pass over moments. First
+// come the formulas c(s), then the formulas as functions of the field inside, then all curves, measured ones included
+// (tables.h). ``slope`` is k = 3χ/(3+χ).
 #pragma once
 #include "material/tables.h"
 
 namespace warpmag {
 
-enum Curve { MIXED = -1, TANH, LANGEVIN, CLAMPED, FROHLICH, LINEAR }; // as in curves.py
-static_assert(LINEAR + 1 == FIRST_TABLE, "tables come after curves with a formula");
+// As in curves.py. Curve INNER + i is formula i as a function of the field inside.
+enum Curve { MIXED = -1, TANH, LANGEVIN, CLAMPED, FROHLICH, LINEAR, INNER };
+static_assert(INNER + LINEAR == FIRST_TABLE, "tables come after curves with a formula");
 
 // tanh(s)/s, 1 at s = 0. Below 1e-18 it is set to 1, since a quotient of denormals is inaccurate.
 CUDA_CALLABLE inline Real tanh_ratio(Real s) { return s < Real(1e-18) ? Real(1) : wp::tanh(s) / s; }
@@ -64,9 +66,9 @@ CUDA_CALLABLE inline Real curve_slope(Real s, int curve) {
 }
 
 // Derivative c'(s) where the reduced magnetization c(s) has a given square.
-CUDA_CALLABLE inline Number curve_steepness(Number reduced_square, int curve) {
-    const Number zero = reduced_square * Real(0), one = zero + 1;
-    Number steepness = one - reduced_square;                                       // of tanh: c' = 1 − c²
+template <class N> CUDA_CALLABLE inline N curve_steepness(N reduced_square, int curve) {
+    const N zero = reduced_square * Real(0), one = zero + 1;
+    N steepness = one - reduced_square;                                            // of tanh: c' = 1 − c²
     if (curve == CLAMPED) steepness = reduced_square < Real(0.99999) ? one : zero; // M = Ms up to rounding
     if (curve == LINEAR) steepness = one;
     if (curve == FROHLICH) steepness = (one - root(reduced_square)) * (one - root(reduced_square));
@@ -77,8 +79,8 @@ CUDA_CALLABLE inline Number curve_steepness(Number reduced_square, int curve) {
             1.264510831049312,    -0.0960163093945858, -0.4838736226305589, -0.21565177679233247, -0.11643126163366144,
             -0.00807874082630003, 0.09545970643540323, 1.0531288294918555};
         steepness *= 3 * steepness / (3 + reduced_square * reduced_square);
-        const Number x = 2 * root(reduced_square) - 1;
-        Number fit = zero;
+        const N x = 2 * root(reduced_square) - 1;
+        N fit = zero;
         for (int k = 0; k < 13; ++k) fit = fit * x + fitted[k];
         steepness *= fit;
     }
@@ -119,22 +121,85 @@ CUDA_CALLABLE inline double curve_area(double s, int curve) {
     return z * (0.5 - z * (1.0 / 12 - z * (1.0 / 45 - z * (17.0 / 2520 - z * 31 / 14175))));
 }
 
+// ---------- Formulas as functions of the field inside: s = b y + a c(y), a = k/3, b = 1 − a = k/χ ----------
+
+// b, which is positive even for an ideally permeable material, so that y is finite.
+template <class N> CUDA_CALLABLE inline N inner_share(N slope) {
+    constexpr Real least = sizeof(Real) == 4 ? 1e-11 : 1e-20;
+    return larger(1 - slope * Real(1.0 / 3), slope * 0 + least);
+}
+
+constexpr Real SATURATING = sizeof(Real) == 4 ? 1e7 : 1e16; // reduced field beyond which c = 1 up to rounding
+
+// Reduced field y inside at a reduced field s, at most SATURATING, by Newton's method. s is concave in y, so the
+// iteration rises from below. It takes about five steps, and more only for s ≈ 1 at a large susceptibility.
+template <class N> WARPMAG_CALLED inline N inner_field(N s, N slope, int formula) {
+    constexpr Real tolerance = sizeof(Real) == 4 ? 1e-6 : 1e-14; // of s, at which one more step suffices
+    const N b = inner_share(slope), a = 1 - b, bounded = s > SATURATING ? s * 0 + SATURATING : s;
+    const N least = larger(bounded, (bounded - a) / b); // from c(y) ≤ y and c(y) ≤ 1
+    N y = least;
+    for (int step = 0; step < 60; ++step) {
+        const N c = curve_ratio(y, formula) * y, missing = bounded - b * y - a * c;
+        const N steepness = larger(curve_steepness(c * c, formula), s * 0);
+        y = larger(y + missing / (b + a * steepness), least);
+        if (!any((missing < 0 ? -missing : missing) > tolerance * bounded)) break;
+    }
+    return y;
+}
+
+// dc/ds of a curve of the field inside that has dc/dy; likewise c/s for c/y.
+template <class N> CUDA_CALLABLE inline N with_inner_field(N quotient, N slope) {
+    const N b = inner_share(slope);
+    return quotient / (b + (1 - b) * quotient);
+}
+
+// The functions above for formulas of both kinds.
+template <class N> CUDA_CALLABLE inline N curve_ratio(N s, N slope, int curve) {
+    if (curve < INNER) return curve_ratio(s, curve);
+    const N ratio = with_inner_field(curve_ratio(inner_field(s, slope, curve - INNER), curve - INNER), slope);
+    return s > SATURATING ? 1 / s : ratio;
+}
+CUDA_CALLABLE inline Real curve_slope(Real s, Real slope, int curve) {
+    if (curve < INNER) return curve_slope(s, curve);
+    return with_inner_field(curve_slope(inner_field(s, slope, curve - INNER), curve - INNER), slope);
+}
+CUDA_CALLABLE inline Number curve_steepness(Number square, Number slope, int curve) {
+    if (curve < INNER) return curve_steepness(square, curve);
+    return with_inner_field(larger(curve_steepness(square, curve - INNER), square * 0), slope);
+}
+CUDA_CALLABLE inline Real inverse_curve_ratio(Real c, Real slope, int curve) {
+    if (curve < INNER) return inverse_curve_ratio(c, curve);
+    const Real b = inner_share(slope);
+    return b * inverse_curve_ratio(c, curve - INNER) + (1 - b);
+}
+CUDA_CALLABLE inline double curve_area(Real s, Real slope, int curve) {
+    if (curve < INNER) return curve_area(double(s), curve);
+    const Real own = inner_field(s, slope, curve - INNER);
+    const double b = inner_share(slope), y = own, c = double(curve_ratio(own, curve - INNER)) * y;
+    const double missing = s - b * y - (1 - b) * c; // error of y, and s beyond SATURATING
+    return b * curve_area(y, curve - INNER) + (1 - b) * c * c / 2 + missing * c;
+}
+
+// ---------- All curves ----------
+
 // Curves of a vector of moments: ``common`` is the id of all, or MIXED; ``each`` is the id of each.
 struct Curves {
     int common;
     Index each;
     const Real* tables;
+    Number slope;
 };
 
 // Curves of ``lane_count`` moments from number i on. If ``common`` is MIXED, their ids are read one by one.
-CUDA_CALLABLE inline Curves curves_of(const int* curve, int common, const Real* tables, int i, int lane_count) {
+CUDA_CALLABLE inline Curves curves_of(const int* curve, int common, const Real* tables, Number slope, int i,
+                                      int lane_count) {
 #if defined(__CUDA_ARCH__)
-    return {curve[i], curve[i], tables};
+    return {curve[i], curve[i], tables, slope};
 #else
     Index each = common;
     if (common == MIXED)
         for (int l = 0; l < WIDTH; ++l) each[l] = curve[i + (l < lane_count ? l : 0)];
-    return {common, each, tables};
+    return {common, each, tables, slope};
 #endif
 }
 
@@ -159,10 +224,10 @@ CUDA_CALLABLE inline Number curve_ratio(Number s, const Curves& curves) {
 #if !defined(__CUDA_ARCH__)
     if (curves.common == MIXED)
         return of_mixed(
-            curves, [=](int curve) { return curve_ratio(s, curve); },
+            curves, [=](int curve) { return curve_ratio(s, curves.slope, curve); },
             [=](Index each) { return table_ratio(s, each, curves.tables); });
 #endif
-    return curve_ratio(s, curves.common);
+    return curve_ratio(s, curves.slope, curves.common);
 }
 
 // c'(s) of any curve where c(s) has a given square.
@@ -171,24 +236,24 @@ CUDA_CALLABLE inline Number curve_steepness(Number square, const Curves& curves)
 #if !defined(__CUDA_ARCH__)
     if (curves.common == MIXED)
         return of_mixed(
-            curves, [=](int curve) { return curve_steepness(square, curve); },
+            curves, [=](int curve) { return curve_steepness(square, curves.slope, curve); },
             [=](Index each) { return table_steepness(root(square), each, curves.tables); });
 #endif
-    return curve_steepness(square, curves.common);
+    return curve_steepness(square, curves.slope, curves.common);
 }
 
 // The same for one moment, called by Warp functions.
-CUDA_CALLABLE inline Real curve_ratio(Real s, int curve, const Real* tables) {
-    return curve >= FIRST_TABLE ? table_ratio(s, curve, tables) : curve_ratio(s, curve);
+CUDA_CALLABLE inline Real curve_ratio(Real s, Real slope, int curve, const Real* tables) {
+    return curve >= FIRST_TABLE ? table_ratio(s, curve, tables) : curve_ratio(s, slope, curve);
 }
-CUDA_CALLABLE inline Real curve_slope(Real s, int curve, const Real* tables) {
-    return curve >= FIRST_TABLE ? table_slope(s, curve, tables) : curve_slope(s, curve);
+CUDA_CALLABLE inline Real curve_slope(Real s, Real slope, int curve, const Real* tables) {
+    return curve >= FIRST_TABLE ? table_slope(s, curve, tables) : curve_slope(s, slope, curve);
 }
-CUDA_CALLABLE inline Real inverse_curve_ratio(Real c, int curve, const Real* tables) {
-    if (curve < FIRST_TABLE) return inverse_curve_ratio(c, curve);
+CUDA_CALLABLE inline Real inverse_curve_ratio(Real c, Real slope, int curve, const Real* tables) {
+    if (curve < FIRST_TABLE) return inverse_curve_ratio(c, slope, curve);
     return inverse_table_ratio(c < Real(0.999999) ? c : Real(0.999999), curve, tables);
 }
-CUDA_CALLABLE inline double curve_area(Real s, int curve, const Real* tables) {
-    return curve >= FIRST_TABLE ? table_area(s, curve, tables) : curve_area(double(s), curve);
+CUDA_CALLABLE inline double curve_area(Real s, Real slope, int curve, const Real* tables) {
+    return curve >= FIRST_TABLE ? table_area(s, curve, tables) : curve_area(s, slope, curve);
 }
 }

@@ -13,8 +13,13 @@ k = 3χ/(3+χ) is the initial slope of a ball of susceptibility χ. ``curves.h``
 Warp functions of this module, for float32 or float64, take ``native_options("material/curves.h", dtype=dtype)``. The
 curve c = s (``LINEAR``) has no token; it is the response of a permanent magnet.
 
+**Balls and cells.** A moment's field H is that of all others, without its own field −M/3. A ball has ‖M‖ = Ms c(s) in
+this field, as in the paper. A cell of a body of any shape has ‖M‖ = Ms c(y) in the field H' = H − M/3 inside, with
+y = χ H'/Ms. Then s = b y + a c(y), a = k/3, b = 1 − a = k/χ, and curve ``INNER + i`` is M as a function of s.
+``clamped`` and ``LINEAR`` are the same function for both. The token ``tanh-applied`` is Eq. 10 for cells, too.
+
 **Measured curves.** A table gives M as a function of the field H' inside the material. With y = k H'/Ms and c = M/Ms,
-the reduced field at a ball is s = y + (k/3) c. Between two knots c is cubic in y,
+the reduced field of a ball or a cell is s = y + (k/3) c. Between two knots c is cubic in y,
 
     c = c_i + t (c1 + t (c2 + t c3)),    y = y_i + t span,    t in [0, 1].
 
@@ -37,10 +42,18 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-MIXED, TANH, LANGEVIN, CLAMPED, FROHLICH, LINEAR, FIRST_TABLE = range(-1, 6)
-"""Ids of the curves; as in ``curves.h`` and ``tables.h``."""
-CURVE_IDS = {"tanh": TANH, "langevin": LANGEVIN, "clamped": CLAMPED, "frohlich": FROHLICH}
-"""Ids of the curves with a token."""
+MIXED, TANH, LANGEVIN, CLAMPED, FROHLICH, LINEAR, INNER = range(-1, 6)
+"""Ids of the curves; ``INNER + TANH`` is tanh as a function of the field inside. As in ``curves.h``."""
+FIRST_TABLE = INNER + LINEAR
+"""Id of the first measured curve; as in ``tables.h``."""
+CURVE_IDS = {
+    "tanh": (TANH, INNER + TANH),
+    "langevin": (LANGEVIN, INNER + LANGEVIN),
+    "clamped": (CLAMPED, CLAMPED),
+    "frohlich": (FROHLICH, INNER + FROHLICH),
+    "tanh-applied": (TANH, TANH),
+}
+"""Ids of the curves with a token, of a ball and of a cell."""
 _COLUMNS = 8
 _BEYOND = 1e30  # reduced field and magnetization of the padding, which no field reaches
 
@@ -52,7 +65,7 @@ class CurveParameters:
     inducible: wp.array  # 1 for inducible moments, 0 for permanent ones, shape [n]
     saturation: wp.array  # saturation magnetization Ms [A/m], shape [n]
     slope: wp.array  # slope k = 3χ/(3+χ) [dimensionless], the largest of the curve, shape [n]
-    curve: wp.array  # id, one of ``CURVE_IDS``, or ``FIRST_TABLE`` + i for measured curve i of ``tables``, shape [n]
+    curve: wp.array  # id of a formula, or ``FIRST_TABLE`` + i for measured curve i of ``tables``, shape [n]
     common_curve: int  # common curve id of all inducible moments, or ``MIXED``
     tables: wp.array  # measured curves (:func:`curve_tables`)
 
@@ -93,20 +106,20 @@ def _rows(measured) -> np.ndarray:
 
 for _dtype in (wp.float32, wp.float64):
 
-    @wp.func_native("return warpmag::curve_ratio(s, curve, tables.data);")
-    def curve_ratio(s: _dtype, curve: int, tables: wp.array2d[_dtype]) -> _dtype:
+    @wp.func_native("return warpmag::curve_ratio(s, k, curve, tables.data);")
+    def curve_ratio(s: _dtype, k: _dtype, curve: int, tables: wp.array2d[_dtype]) -> _dtype:
         """c(s)/s, the factor between a reduced field vector and its reduced magnetization; 1 at s = 0."""
 
-    @wp.func_native("return warpmag::curve_slope(s, curve, tables.data);")
-    def curve_slope(s: _dtype, curve: int, tables: wp.array2d[_dtype]) -> _dtype:
+    @wp.func_native("return warpmag::curve_slope(s, k, curve, tables.data);")
+    def curve_slope(s: _dtype, k: _dtype, curve: int, tables: wp.array2d[_dtype]) -> _dtype:
         """Derivative c'(s) for s ≥ 0."""
 
-    @wp.func_native("return warpmag::curve_area(s, curve, tables.data);")
-    def curve_area(s: _dtype, curve: int, tables: wp.array2d[_dtype]) -> wp.float64:
+    @wp.func_native("return warpmag::curve_area(s, k, curve, tables.data);")
+    def curve_area(s: _dtype, k: _dtype, curve: int, tables: wp.array2d[_dtype]) -> wp.float64:
         """Area ∫ c ds from 0 to ``s``."""
 
-    @wp.func_native("return warpmag::inverse_curve_ratio(c, curve, tables.data);")
-    def inverse_curve_ratio(c: _dtype, curve: int, tables: wp.array2d[_dtype]) -> _dtype:
+    @wp.func_native("return warpmag::inverse_curve_ratio(c, k, curve, tables.data);")
+    def inverse_curve_ratio(c: _dtype, k: _dtype, curve: int, tables: wp.array2d[_dtype]) -> _dtype:
         """Ratio s/c of the reduced field s to the reduced magnetization ``c``; large but finite at saturation."""
 
 
@@ -115,10 +128,10 @@ def curve_derivative_times(h: Any, v: Any, k: Any, saturation: Any, curve: int, 
     """Product f'(H) v of the curve's derivative ∂M/∂H at field ``h`` [A/m] with a vector ``v`` (for Eq. 4)."""
     norm = wp.length(h)
     s = k * norm / saturation
-    perpendicular = k * curve_ratio(s, curve, tables)
+    perpendicular = k * curve_ratio(s, k, curve, tables)
     if norm == type(norm)(0.0):
         return perpendicular * v
     unit = h / norm
-    parallel = k * curve_slope(s, curve, tables)
+    parallel = k * curve_slope(s, k, curve, tables)
     # f' v = k (c/s) v + k (c' − c/s) (u·v) u
     return perpendicular * v + ((parallel - perpendicular) * wp.dot(unit, v)) * unit

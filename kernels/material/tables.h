@@ -5,7 +5,7 @@
 
 namespace warpmag {
 
-constexpr int FIRST_TABLE = 5; // id of the first table's curve; as in curves.py
+constexpr int FIRST_TABLE = 9; // id of the first table's curve; as in curves.py
 // Columns of a row, as in curves.py. The last row of a curve has span 0; its KNOT_C1 and KNOT_C2 are z and a.
 enum TableColumn { KNOT_S, KNOT_C, KNOT_SPAN, KNOT_C1, KNOT_C2, KNOT_C3, KNOT_AREA, KNOT_SHEAR, TABLE_COLUMNS };
 

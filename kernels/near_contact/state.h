@@ -53,7 +53,9 @@ struct NearArrays {
         return slot_at(conductance_slopes, CONTACT_SLOTS, CONDUCTANCE_SLOPE_ROWS, s, i);
     }
     CUDA_CALLABLE Real* pair_force(int s, int i) const { return slot_at(pair_forces, CONTACT_SLOTS, 3, s, i); }
-    CUDA_CALLABLE Curves curves(int i) const { return curves_of(curve, common_curve, curve_tables, i, WIDTH); }
+    CUDA_CALLABLE Curves curves(int i) const {
+        return curves_of(curve, common_curve, curve_tables, numbers(curve_slope + i), i, WIDTH);
+    }
     // Row of a component of the moments m.
     CUDA_CALLABLE const Real* moment(int component, int i) const {
         return packed + (size_t)(4 + component) * moment_stride + i;

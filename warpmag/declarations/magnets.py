@@ -17,8 +17,12 @@ from warpmag.errors import InputError
 KINDS = ("inducible", "permanent")
 LINEAR_CURVE = "linear"
 """Curve of permanent magnets with recoil. Stages have no such token, because every inducible magnet saturates."""
-CURVES = ("tanh", "langevin", "clamped", "frohlich")
-"""Formulas of magnetization curves (``kernels.material.curves``); a model stores the position in this list."""
+CURVES = ("tanh", "langevin", "clamped", "frohlich", "tanh-applied")
+"""Formulas of magnetization curves (``kernels.material.curves``); a model stores the position in this list.
+
+A formula gives the magnetization of a ball in the field of all others, and of a cell in the field inside the material.
+``tanh-applied``, which the paper's scenes use, is ``tanh`` in the field of all others for cells, too.
+"""
 FORCES = ("kelvin", "zeeman")
 CONTACT_MODELS = ("dipole", "multipole")
 METHODS = ("auto", "direct", "fmm")
@@ -102,7 +106,9 @@ class Magnet:
     curve: Annotated[str | MagnetizationCurve, Attribute(
         "curve", "token", "Magnetization Curve",
         "Magnetization curve of an inducible magnet: a formula, or the measured curve of a material. A measured "
-        "curve replaces saturation magnetization and susceptibility.",
+        "curve replaces saturation magnetization and susceptibility. A formula is a function of the field of all "
+        "others for a ball of one moment, and of the field inside for other shapes. tanh-applied is tanh of the field "
+        "of all others for every shape.",
         tokens=(*CURVES, *MEASURED_CURVES), check=check_curve, uniform=True, kind="inducible",
     )] = "tanh"  # fmt: skip
     magnetization: Annotated[tuple[float, float, float], Attribute(
@@ -226,7 +232,7 @@ class Preset:
 
 PRESETS = {
     "warpmag": Preset(dynamics="theta", curve="tanh", force="kelvin"),
-    "paper": Preset(dynamics="theta-euler", curve="tanh", force="zeeman"),
+    "paper": Preset(dynamics="theta-euler", curve="tanh-applied", force="zeeman"),
     "kim2018": Preset(dynamics="llg", curve="clamped", force="kelvin"),
 }
 """Published methods: this library's; Kim and Han 2022 as published; Kim, Park and Han 2018."""

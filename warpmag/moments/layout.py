@@ -25,6 +25,7 @@ class MomentLayout:
     bodies: np.ndarray
     movable: np.ndarray  # True if the force on the moment is computed
     single: np.ndarray  # True if the body has no other moment
+    cells: np.ndarray  # True for a cell of a body with demagnetizing tensors
     aligned: np.ndarray  # True for an inducible single ball, parallel to the field, so that its torque is 0
 
     @property
@@ -84,7 +85,7 @@ def make_layout(radii, worlds, permanent, bodies, movable, dtype) -> MomentLayou
     check_bodies("bodies: numbers too large", int(bodies.max(initial=-1)) + 1, dtype)
     _, body, size = np.unique(bodies, return_inverse=True, return_counts=True)
     single = size[body] == 1
-    return MomentLayout(radii, worlds, permanent, bodies, movable, single, ~permanent & single)
+    return MomentLayout(radii, worlds, permanent, bodies, movable, single, np.zeros(n, bool), ~permanent & single)
 
 
 def with_cells(layout: MomentLayout, couplings) -> MomentLayout:
@@ -92,7 +93,7 @@ def with_cells(layout: MomentLayout, couplings) -> MomentLayout:
     cells = np.zeros(len(layout.radii), bool)
     for first, coupling in couplings:
         cells[first : first + len(coupling.start) - 1] = True
-    return replace(layout, aligned=layout.aligned & ~cells)
+    return replace(layout, cells=cells, aligned=layout.aligned & ~cells)
 
 
 @dataclass(frozen=True)
@@ -101,17 +102,18 @@ class MomentMaterial:
 
     A curve is one of ``magnets.CURVES``, or a measured ``MagnetizationCurve``, which also determines saturation and
     susceptibility. A tuple or list holds one curve for each moment. ``magnets.LINEAR_CURVE`` is the response of a
-    permanent magnet of recoil permeability 1 + χ.
+    permanent magnet of recoil permeability 1 + χ. A formula is a function of the field inside for cells, of the field
+    of all others for balls.
     """
 
     saturation: Any = 1.0  # saturation magnetization Ms [A/m], scalar or [n]
     susceptibility: Any = math.inf  # [dimensionless], scalar or [n]
     curve: Any = "tanh"
 
-    def parameters(self, permanent: np.ndarray, dtype, device) -> tuple[CurveParameters, np.ndarray]:
+    def parameters(self, layout: MomentLayout, dtype, device) -> tuple[CurveParameters, np.ndarray]:
         """Return the material for kernels, and the susceptibility of each moment, 1 for a permanent one, shape [n]."""
-        n = len(permanent)
-        ids, measured = _curve_ids(self.curve, n)
+        permanent, n = layout.permanent, len(layout.permanent)
+        ids, measured = _curve_ids(self.curve, layout.cells)
         saturation = np.where(permanent, 1.0, host_scalars("saturation", self.saturation, n))
         susceptibility = host_scalars("susceptibility", self.susceptibility, n, infinite=True)
         susceptibility = np.where(permanent, 1.0, susceptibility)
@@ -151,17 +153,18 @@ def _slope(susceptibility):
     return 3.0 / (1.0 + 3.0 / susceptibility)
 
 
-def _curve_ids(curve, n: int) -> tuple[np.ndarray, list[MagnetizationCurve]]:
+def _curve_ids(curve, cells: np.ndarray) -> tuple[np.ndarray, list[MagnetizationCurve]]:
     """Return the number by which kernels select each moment's curve, shape [n], and the list of measured curves."""
+    n = len(cells)
     is_list = isinstance(curve, (tuple, list)) and len(curve) == n
     measured: dict[MagnetizationCurve, int] = {}
-    numbers: dict[int, int] = {}  # by identity, because the moments of a body share a curve object
+    numbers: dict[int, tuple[int, int]] = {}  # of a ball and a cell; by identity, because a body's moments share it
 
-    def number(curve) -> int:
+    def number(curve) -> tuple[int, int]:
         if isinstance(curve, MagnetizationCurve):
-            return measured.setdefault(curve, FIRST_TABLE + len(measured))
+            return (measured.setdefault(curve, FIRST_TABLE + len(measured)),) * 2
         if curve == LINEAR_CURVE:
-            return LINEAR
+            return LINEAR, LINEAR
         check_token("curve", curve, tuple(CURVE_IDS))
         return CURVE_IDS[curve]
 
@@ -169,4 +172,5 @@ def _curve_ids(curve, n: int) -> tuple[np.ndarray, list[MagnetizationCurve]]:
         if id(item) not in numbers:
             numbers[id(item)] = number(item)
     ids = [numbers[id(item)] for item in curve] if is_list else numbers[id(curve)]
-    return np.array(np.broadcast_to(ids, n), np.int32), list(measured)
+    of_ball, of_cell = np.broadcast_to(np.reshape(np.asarray(ids, np.int32), (-1, 2)), (n, 2)).T
+    return np.where(cells, of_cell, of_ball), list(measured)

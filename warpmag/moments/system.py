@@ -152,7 +152,7 @@ class MomentSystem:
         near, theta = settings.contact_model == "multipole", settings.dynamics == "theta"
         self._allocate(layout, external_field)
         material = material or MomentMaterial()
-        self.material, susceptibility = material.parameters(layout.permanent, self.dtype, self.device)
+        self.material, susceptibility = material.parameters(layout, self.dtype, self.device)
         layout = self._make_bias(layout)
         self._make_sources(layout, sources, solids)
         rotatable = ~layout.aligned | settings.single_torque

@@ -45,7 +45,8 @@ def add_inducible(
         susceptibility: Susceptibility χ [dimensionless], infinite by default.
         curve: Magnetization curve: one of ``magnets.CURVES``, ``tanh`` by default, or a measured curve: a
             :class:`warpmag.MagnetizationCurve` or the name of a material with a measured curve. A measured curve
-            replaces saturation and susceptibility.
+            replaces saturation and susceptibility. A formula gives M in the field of all others for a ball of one
+            moment, and in the field inside for other shapes. ``tanh-applied`` takes the field of all others for both.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
         conductivity: Electrical conductivity [S/m] of a ball of one moment, its body's only magnet. Eddy currents brake
             a conductor that moves through the field. 0 means no eddy currents. ``material`` does not set it, since eddy
