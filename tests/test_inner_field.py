@@ -4,7 +4,7 @@ import newton
 import numpy as np
 import pytest
 from cell_bodies import demagnetizing_matrix, make_system
-from scipy.optimize import brentq, root
+from scipy.optimize import root, root_scalar
 
 import warpmag
 from bench.reference import oracle
@@ -125,7 +125,8 @@ def test_a_sphere_of_cells_takes_the_moment_of_the_closed_form(susceptibility, d
             device, lambda builder, body: builder.add_shape_sphere(body, radius=0.01), strength * MS * np.eye(3)[2],
             spacing=0.0025, saturation=MS, susceptibility=susceptibility,
         )  # fmt: skip
-        exact = brentq(lambda m, h=strength: m - np.tanh(susceptibility * (h - m / 3.0)), 0.0, 1.0)
+        excess = lambda m, h=strength: m - np.tanh(susceptibility * (h - m / 3.0))  # noqa: E731
+        exact = root_scalar(excess, bracket=(0.0, 1.0)).root
         assert found == pytest.approx(MS * exact, rel=1e-2)
 
 
@@ -147,7 +148,7 @@ def test_force_on_a_saturating_body_is_the_gradient_of_its_energy(curve, device)
     assert reached.max() > 0.9
     slope = [(solved(place + d).energy()[0] - solved(place - d).energy()[0]) / (2.0 * step) for d in step * np.eye(3)]
     forces = system.forces.numpy()
-    scale = np.linalg.norm(slope)
+    scale = float(np.linalg.norm(slope))
     np.testing.assert_allclose(forces[-1], -np.array(slope), rtol=0, atol=1e-5 * scale)  # step² over the distance²
     np.testing.assert_allclose(forces[:-1].sum(axis=0), slope, rtol=0, atol=1e-5 * scale)
 

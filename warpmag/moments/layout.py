@@ -162,7 +162,8 @@ def _curve_ids(curve, cells: np.ndarray) -> tuple[np.ndarray, list[Magnetization
 
     def number(curve) -> tuple[int, int]:
         if isinstance(curve, MagnetizationCurve):
-            return (measured.setdefault(curve, FIRST_TABLE + len(measured)),) * 2
+            table = measured.setdefault(curve, FIRST_TABLE + len(measured))
+            return table, table
         if curve == LINEAR_CURVE:
             return LINEAR, LINEAR
         check_token("curve", curve, tuple(CURVE_IDS))
