@@ -15,8 +15,8 @@ References: Kim and Han 2022, "Fast Stabilization of Inducible Magnet Simulation
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -158,7 +158,7 @@ def curve_slope(susceptibility):
     return np.where(np.isinf(susceptibility), 3.0, 3.0 / (1.0 + 3.0 / susceptibility))
 
 
-def reduced_curve(s, curve: Any) -> tuple[np.ndarray, np.ndarray]:
+def reduced_curve(s, curve: str | Callable) -> tuple[np.ndarray, np.ndarray]:
     """Reduced magnetization ‖M‖/Ms of a reduced field s = k‖H‖/Ms, and its derivative.
 
     ``curve`` is the name of a curve, or a function of s that returns both.
