@@ -4,7 +4,7 @@ Needs Netgen: ``pip install ngsolve``. Elements are as small as the gap between 
 toward edges and corners, where the field is singular (hp refinement).
 """
 
-# pyright: reportMissingImports=false, reportMissingModuleSource=false
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 
 import math
 from dataclasses import dataclass

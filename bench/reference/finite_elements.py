@@ -8,7 +8,7 @@ The force on a body is −∫ T ∇g over the air, T Maxwell's stress. g is harm
 equals the integral of T over a surface around the body, averaged over such surfaces.
 """
 
-# pyright: reportMissingImports=false, reportMissingModuleSource=false
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 
 import argparse
 import json
