@@ -30,7 +30,7 @@ _FLATTEST = 3.0
 a surface cuts off, of little volume."""
 CLOSE = 1.75, 2.25
 """Distances at which the average over close boxes turns into their quadrupoles, in means of their longest sides."""
-HARDENING = 0.3
+HARDENING = 0.45
 """Demagnetizing factor added to a cell inside another body. Quadrature over intersecting boxes leaves eigenvalues of
 -0.05."""
 _LONGEST_LIST = 2048
