@@ -44,10 +44,10 @@ def quadrupole_tensor(r: np.ndarray, spread: np.ndarray) -> np.ndarray:
     """½ Σ S_cd ∂_a ∂_b ∂_c ∂_d of 1/(4πr) [1/m³], shape [3, 3], for the ``spread`` S [m²] of two boxes."""
     d, eye = np.linalg.norm(r), np.eye(3)
     fourth = 105.0 * np.einsum("a,b,c,d->abcd", r, r, r, r) / d**9
-    for one, two in (("ab", "cd"), ("ac", "bd"), ("ad", "bc"), ("bc", "ad"), ("bd", "ac"), ("cd", "ab")):
-        fourth -= 15.0 * np.einsum(f"{one},{two[0]},{two[1]}->abcd", eye, r, r) / d**7
-    for one, two in (("ab", "cd"), ("ac", "bd"), ("ad", "bc")):
-        fourth += 3.0 * np.einsum(f"{one},{two}->abcd", eye, eye) / d**5
+    for pair, rest in (("ab", "cd"), ("ac", "bd"), ("ad", "bc"), ("bc", "ad"), ("bd", "ac"), ("cd", "ab")):
+        fourth -= 15.0 * np.einsum(f"{pair},{rest[0]},{rest[1]}->abcd", eye, r, r) / d**7
+    for pair, rest in (("ab", "cd"), ("ac", "bd"), ("ad", "bc")):
+        fourth += 3.0 * np.einsum(f"{pair},{rest}->abcd", eye, eye) / d**5
     return 0.5 * np.einsum("cd,abcd->ab", spread, fourth) / (4.0 * np.pi)
 
 

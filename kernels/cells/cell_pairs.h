@@ -19,7 +19,7 @@ constexpr Real POSE_TOLERANCE = Real(3e-5);   // largest change of a pose, in si
 
 constexpr int CLASSES = 16, BINS = CLASSES * CLASSES; // of rows by their numbers of close and of all candidates
 
-enum CellPairPass { LOCATE, CLEAR, SELECT, ARRANGE, PLACE, TABULATE, ADD_FIELD, ADD_FORCE }; // as in cell_pairs.py
+enum CellPairPass { LOCATE, CLEAR, SELECT, ARRANGE, ASSIGN, TABULATE, ADD_FIELD, ADD_FORCE }; // as in cell_pairs.py
 
 // Writes the frame of body i, and raises a flag if cell i has moved so far that candidates are searched again.
 template <class Pairs> CUDA_CALLABLE inline void locate(const Pairs& a, int i) {
@@ -96,7 +96,7 @@ template <class Pairs> CUDA_CALLABLE inline void arrange(const Pairs& a) {
 }
 
 // Gives a row to cell i, with poses of no pair, so that all entries are computed.
-template <class Pairs> CUDA_CALLABLE inline void place(const Pairs& a, int i) {
+template <class Pairs> CUDA_CALLABLE inline void assign(const Pairs& a, int i) {
     if (a.bin.data[i] < 0) return;
     const int row = increment(a.bin_end.data + a.bin.data[i]), count = a.candidate_count.data[i];
     a.cell.data[row] = i;
@@ -293,7 +293,7 @@ template <class Pairs> CUDA_CALLABLE inline void arrange_rows(const Pairs& a, in
     if (pass == ARRANGE && i == 0) arrange(a);
     if (i >= a.group.shape[0]) return;
     if (pass == SELECT) select(a, i);
-    if (pass == PLACE) place(a, i);
+    if (pass == ASSIGN) assign(a, i);
 }
 
 template <class Pairs> CUDA_CALLABLE inline void make_cell_pair_pass(const Pairs& a, int pass, int i) {

@@ -41,7 +41,7 @@ _SAMPLES = 32
 """Points whose neighbors are counted for the length of the lists."""
 _MARGIN = 0.5
 """Part of half its size that a cell may move before candidates are searched again."""
-LOCATE, CLEAR, SELECT, ARRANGE, PLACE, TABULATE, ADD_FIELD, ADD_FORCE = range(8)
+LOCATE, CLEAR, SELECT, ARRANGE, ASSIGN, TABULATE, ADD_FIELD, ADD_FORCE = range(8)
 """The passes, in order; as in ``cell_pairs.h``."""
 _TENSOR_ROWS, _POSE_ROWS = 6, 7
 """Numbers of a tensor and of a relative pose; as in ``cell_pairs.h``."""
