@@ -154,6 +154,7 @@ class CellPairs:
     Args:
         bodies: First moment and coupling of each body. A coupling has ``half_sides`` and ``grid_rotation`` of its cells
             (``warpmag.shapes.demagnetization``).
+        takes_part: False for bodies whose near field has a closed form, shape [bodies].
         rotations: Rotation from each body's frame to the world, Warp array, shape [bodies].
         worlds: World of each moment, shape [n].
         movable: True for moments whose force is evaluated, shape [n].
@@ -166,18 +167,20 @@ class CellPairs:
         crowded: 1 if a cell had more candidates than a list holds and took no part, Warp array, shape [1].
     """
 
-    def __init__(self, bodies, rotations, worlds, movable, packed, moments, h, forces, torques):
+    def __init__(self, bodies, takes_part, rotations, worlds, movable, packed, moments, h, forces, torques):
         """Lay out the arrays on the device of the moments."""
         dtype, device, n = packed.dtype, packed.device, packed.count
         group, body, half = np.full(n, -1), np.zeros(n, int), np.ones((4, n))
         for number, (first, coupling) in enumerate(bodies):
+            if not takes_part[number]:
+                continue
             cells = slice(first, first + len(coupling.radii))
             sides = coupling.half_sides.T
             group[cells], body[cells], half[:3, cells] = worlds[cells], number, sides
             most, least = sides.max(axis=0), sides.min(axis=0)
             half[3, cells] = 2.0 * most * np.sqrt(np.minimum(most / least, _FLATTEST)) * _volume_factors(sides)
         ratio, reach = WINDOW[1] + _MARGIN, float(half[3, group >= 0].max())
-        capacity = _list_length(bodies, group, ratio * reach)
+        capacity = _list_length([body for body in bodies if group[body[0]] >= 0], group, ratio * reach)
         padded = -(-int((group >= 0).sum()) // CHUNK) * CHUNK
 
         def put(values, kind=wp.int32):

@@ -159,7 +159,7 @@ class MomentSystem:
         self._fast = fast_sums_for(settings.method, self._packed, layout, body_extent, float(settings.rtol))
         self.is_fast = isinstance(self._fast, SystemSums)
         self._make_field(layout, near)
-        self._make_cells(layout, couplings, responses=theta)
+        self._make_cells(layout, couplings, {solid.first for solid in solids}, responses=theta)
         self._make_wrench(layout, rotatable)
         self._permanent_fields = None
         self._near = self._make_near_contacts(layout, rotatable, susceptibility) if near else None
@@ -225,24 +225,29 @@ class MomentSystem:
         more = {"extra_parts": int(near), "sums": self._inducible_sums, "ranks": self._ranks}
         self._inducible_field = PairEvaluation(Quantity.FIELD, of_inducible, packed, packed, state.h0, self.h, **more)
 
-    def _make_cells(self, layout: MomentLayout, couplings, responses: bool):
-        """Prepare the corrections between cells; ``responses`` is True if small bodies respond collectively."""
+    def _make_cells(self, layout: MomentLayout, couplings, closed_forms: set[int], responses: bool):
+        """Prepare the corrections between cells.
+
+        ``closed_forms`` are the first moments of bodies whose near field has a closed form, in place of corrections.
+        ``responses`` is True if small bodies respond collectively.
+        """
         self._cells = self._cell_pairs = self.rotations = self.crowded = None
         if couplings:
             collective = [responses and len(coupling.radii) <= MOST_CELLS for _, coupling in couplings]
-            several = np.bincount(layout.worlds[[first for first, _ in couplings]]).max() > 1
+            takes_part = [first not in closed_forms for first, _ in couplings]
+            several = np.bincount(layout.worlds[[first for first, _ in couplings]], takes_part).max() > 1
             if several:
                 # common fields describe charges at the edges of a lone body: touching cubes would pull 9 % too much
                 couplings = [
-                    (first, coupling if len(coupling.radii) <= MOST_CELLS else coupling.without_common_fields)
-                    for first, coupling in couplings
+                    (first, coupling.without_common_fields if part and len(coupling.radii) > MOST_CELLS else coupling)
+                    for (first, coupling), part in zip(couplings, takes_part, strict=True)
                 ]
             self._cells = CellCouplings(couplings, self.moments, self.h, collective)
             self.rotations = self._cells.rotations
             if several:
                 self._cell_pairs = CellPairs(
-                    couplings, self.rotations, layout.worlds, layout.movable, self._packed, self.moments, self.h,
-                    self.forces, self.torques,
+                    couplings, takes_part, self.rotations, layout.worlds, layout.movable, self._packed, self.moments,
+                    self.h, self.forces, self.torques,
                 )  # fmt: skip
                 self.crowded = self._cell_pairs.crowded
 
