@@ -74,6 +74,22 @@ def shape_message(name: str, expected: str, array) -> str:
     return f"{name}: shape must be {expected}, got {list(array.shape)}"
 
 
+def check_warp_array(name: str, array: Any, dtype, device, shape: tuple[int, ...] | None = None) -> None:
+    """Raise ``InputError`` unless ``array`` is a Warp array of a type and a shape on a device; values are not read.
+
+    None for ``dtype`` accepts any type, None for ``shape`` any number of entries.
+    """
+    if isinstance(array, wp.array):
+        fits = array.ndim == 1 if shape is None else array.shape == shape
+        if fits and array.device == device and (dtype is None or wp.types.types_equal(array.dtype, dtype)):
+            return
+        actual = f"{list(array.shape)} of {array.dtype.__name__} on {array.device}"
+    else:
+        actual = short_repr(array)
+    kind, size = "" if dtype is None else f" of {dtype.__name__}", "" if shape is None else f" of shape {list(shape)}"
+    raise InputError(f"{name}: must be a Warp array{kind}{size} on {device}, got {actual}")
+
+
 def vec3_type(dtype):
     """Return the Warp three-vector of a scalar type."""
     return wp.vec3 if dtype is wp.float32 else wp.vec3d

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warpmag.declarations.checks import check_whole, short_repr
 from warpmag.errors import InputError
 from warpmag.kernels.applied.fields import AppliedField
 from warpmag.kernels.pairs.evaluate import PairEvaluation
@@ -13,7 +14,7 @@ from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.pairs.point_fields import launch_field_of_worlds, launch_flux_density, launch_store_gradients
 from warpmag.kernels.pairs.wrench import MU0
-from warpmag.moments.arrays import shape_message, vec3_type
+from warpmag.moments.arrays import check_warp_array, host_array, shape_message, vec3_type
 from warpmag.moments.system import MomentSystem
 
 _NO_BODY = -2
@@ -50,9 +51,15 @@ class FieldProbe:
         """Allocate all buffers."""
         self._system = system
         ranges = system.world_ranges
-        worlds = np.zeros(count, int) if worlds is None else np.asarray(worlds, int)
-        if worlds.shape != (count,):
-            raise InputError(shape_message("worlds", f"[{count}]", worlds))
+        check_whole("count", count)
+        if not 0 <= count < 2**31:
+            raise InputError(f"count: must be at least 0 and below 2³¹, got {short_repr(count)}")
+        numbers = host_array("worlds", np.zeros(count) if worlds is None else worlds)
+        if numbers.shape != (count,):
+            raise InputError(shape_message("worlds", f"[{count}]", numbers))
+        worlds = numbers.astype(int)
+        if (worlds != numbers).any():
+            raise InputError("worlds: must be whole numbers")
         if (worlds < 0).any() or (worlds >= len(ranges)).any():
             raise InputError(f"worlds: must be 0 to {len(ranges) - 1}")
         device, dtype = system.device, system.dtype
@@ -94,6 +101,7 @@ class FieldProbe:
     def measure(self) -> None:
         """Launch the computation of the fields of the last solve's moments at :attr:`points`."""
         system, targets = self._system, self._targets
+        check_warp_array("points", self.points, vec3_type(system.dtype), system.device, (targets.count,))
         if targets.count == 0:
             return
         targets.pack(self.points, self._zeros)

@@ -7,7 +7,9 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.engine.magnets.magnetics import Magnetics
+from warpmag.declarations.checks import real_number, short_repr
+from warpmag.engine.magnets.caller_checks import check_state
+from warpmag.engine.magnets.magnetics import Magnetics, check_magnetics
 from warpmag.errors import InputError, extra
 
 _DIRECTION = np.array((0.55, -0.75, 0.45))
@@ -52,11 +54,15 @@ class Display:
             model: The model.
             magnetics: The magnets of the model.
         """
+        methods = (getattr(viewer, name, None) for name in ("set_model", "begin_frame", "log_state"))
+        if isinstance(viewer, type) or not all(map(callable, methods)):
+            raise InputError(f"viewer: must be a viewer of newton.viewer, got {short_repr(viewer)}")
         self.viewer, self.restarted = viewer, False
         self._set_model(model, magnetics)
         self.frame()
 
     def _set_model(self, model: newton.Model, magnetics: Magnetics) -> None:
+        check_magnetics(magnetics, model)
         self._model, self._magnetics = model, magnetics
         self.viewer.set_model(model)
         shapes = magnetics.shapes
@@ -116,7 +122,8 @@ class Display:
             time: Simulated time [s].
             state: The state.
         """
-        self.viewer.begin_frame(time)
+        check_state(state, self._model, "body_q", "particle_q")
+        self.viewer.begin_frame(real_number("time", time))
         self.viewer.log_state(state)
         if not isinstance(self.viewer, newton.viewer.ViewerNull):
             self._show_arrows(state)

@@ -8,10 +8,11 @@ import numpy.typing as npt
 import warp as wp
 
 from warpmag.declarations import materials
-from warpmag.declarations.checks import check_positive
+from warpmag.declarations.checks import check_positive, check_vector, check_whole, short_repr
 from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.magnets import MagneticSettings
 from warpmag.engine.magnets.attributes import NAMESPACE
+from warpmag.engine.magnets.caller_checks import check_state, held_by_model
 from warpmag.engine.magnets.eddy import gather_velocities, set_conductivities
 from warpmag.engine.magnets.grouping import BodyMagnet, find_magnets
 from warpmag.engine.magnets.magnet_system import KINEMATIC, make_system
@@ -29,7 +30,15 @@ from warpmag.kernels.rigid.bodies import (
     set_magnetization,
     sum_moments,
 )
-from warpmag.moments.arrays import CallContext, Numbers, host_array, largest_coordinate, restore_snapshot, take_snapshot
+from warpmag.moments.arrays import (
+    CallContext,
+    Numbers,
+    check_warp_array,
+    host_array,
+    largest_coordinate,
+    restore_snapshot,
+    take_snapshot,
+)
 from warpmag.moments.probe import FieldProbe
 from warpmag.moments.ranks import current_ranks
 from warpmag.terminal import collection_paused
@@ -92,6 +101,7 @@ class Magnetics:
             InputError: The model has no magnets, a setting is out of range, or a magnet outside all worlds would act
                 in several.
         """
+        self._held = held_by_model(model)
         settings = MagneticSettings(external_field, force, dynamics, contact_model, rtol)
         if (all_ranks := current_ranks()) is not None:
             others = {"method": method, "max_evaluations": max_evaluations, "curve": curve, "step": step}
@@ -157,6 +167,17 @@ class Magnetics:
         """
         return self.system.field_error()
 
+    @property
+    def model(self) -> newton.Model:
+        """The model."""
+        return self._model
+
+    def _check_state(self, state: newton.State, *names: str) -> None:
+        """Raise :class:`InputError` unless kernels can read the model and the arrays ``names`` of ``state``."""
+        for held in self._held:
+            held.check()
+        check_state(state, self._model, *names, *(("body_qd",) if self.needs_velocities else ()))
+
     def _map_bodies(self) -> None:
         """Copy the moments of each body and each shape to the device."""
         device = self._model.device
@@ -219,6 +240,7 @@ class Magnetics:
     def induce(self, state: newton.State) -> None:
         """Solve the induction at the poses of ``state``, starting from the last magnetizations."""
         values, system = self._values, self.system
+        self._check_state(state, "body_q")
         self._induced = True
         gather_moments(
             *(state.body_q, self._body_moments, values.present, values.used, system.positions, system.moments),
@@ -237,6 +259,7 @@ class Magnetics:
 
     def add_forces(self, state: newton.State) -> None:
         """Add the forces on the present moments to ``state.body_f``: the second half of :meth:`apply`."""
+        self._check_state(state, "body_q", "body_f")
         self.system.apply_forces()
         system = self.system
         add_wrenches(self._body_moments, self._model, state, system.positions, system.forces, system.torques)
@@ -254,6 +277,7 @@ class Magnetics:
             InputError: A value is out of range, or the contact model has tables for the old value. Or another attribute
                 was changed, such as the kind, the curve or the moment spacing of a magnet.
         """
+        check_whole("flags", flags)
         if not int(flags) & int(newton.ModelFlags.SHAPE_PROPERTIES):
             return
         changed = self._values.changed_materials()
@@ -339,8 +363,7 @@ class Magnetics:
     def _vectors(self, name: str, value, counts: tuple[int, ...]) -> wp.array:
         """Return ``value`` as an array of vectors on the model's device; its length must be one of ``counts``."""
         if isinstance(value, wp.array):  # values are not read: this may run in a graph capture
-            if value.dtype is not wp.vec3 or value.ndim != 1 or value.device != self._model.device:
-                raise InputError(f"{name}: must be a Warp array of vec3 on {self._model.device}")
+            check_warp_array(name, value, wp.vec3, self._model.device)
             vectors = value
         else:
             context = CallContext(wp.get_device(self._model.device), wp.float32, warp_out=False)
@@ -457,13 +480,31 @@ class Magnetics:
         """Set the magnetizations that the next induction starts from.
 
         Args:
-            magnetizations: Magnetization [A/m], world frame, shape [3], by index of inducible shape. The other shapes
-                start from zero.
+            magnetizations: Magnetization [A/m], world frame, shape [3], by index of magnetic shape. Permanent magnets
+                keep their own. The other shapes start from zero.
+
+        Raises:
+            InputError: A shape has no magnet, or a magnetization is not three finite numbers.
         """
+        if not isinstance(magnetizations, dict):
+            raise InputError(f"magnetizations: must be a dictionary by shape, got {short_repr(magnetizations)}")
+        own_shapes = self.shapes.tolist()
+        for shape, magnetization in magnetizations.items():
+            if shape not in own_shapes:
+                raise InputError(f"magnetizations: shape {short_repr(shape)} has no magnet")
+            check_vector(f"magnetizations: shape {shape}", magnetization)
         start = np.zeros((len(self._volumes), 3))
         inducible = ~self._body_moments.permanent.numpy()
-        for part, shape in enumerate(self.shapes.tolist()):
+        for part, shape in enumerate(own_shapes):
             rows = slice(self._first_moments[part], self._first_moments[part + 1])
             if shape in magnetizations and inducible[rows].all():
                 start[rows] = magnetizations[shape]
         self.system.start_from(wp.array(start, dtype=wp.vec3, device=self._model.device))
+
+
+def check_magnetics(magnetics: Magnetics, model: newton.Model) -> None:
+    """Raise :class:`InputError` unless ``magnetics`` are the magnets of ``model``."""
+    if not isinstance(magnetics, Magnetics):
+        raise InputError(f"magnetics: must be a warpmag.Magnetics, got {short_repr(magnetics)}")
+    if magnetics.model is not model:
+        raise InputError("model, magnetics: the magnets belong to another model")

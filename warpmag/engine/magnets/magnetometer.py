@@ -8,8 +8,9 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.declarations.checks import check_not_negative, check_whole, short_repr
-from warpmag.engine.magnets.magnetics import Magnetics
+from warpmag.declarations.checks import check_not_negative, check_positive, check_whole, short_repr
+from warpmag.engine.magnets.caller_checks import check_state
+from warpmag.engine.magnets.magnetics import Magnetics, check_magnetics
 from warpmag.errors import InputError
 from warpmag.kernels.rigid.sources import Sites, find_sites, read_sites
 
@@ -58,11 +59,11 @@ class SensorMagnetometer:
             InputError: No site matches, a match is not a site, the world of a site holds no magnets, or a number is out
                 of range.
         """
+        check_magnetics(magnetics, model)
         check_not_negative("noise", noise)
         check_whole("seed", seed)
-        if not saturation > 0.0:
-            raise InputError(f"saturation: must be positive, got {short_repr(saturation)}")
-        self.sites = _find_sites(model, sites)
+        check_positive("saturation", saturation, infinite=True)
+        self.sites, self._model = _find_sites(model, sites), model
         self._noise, self._saturation, self._seed = float(noise), float(saturation), int(seed)
         worlds = np.maximum(model.shape_world.numpy()[self.sites], 0) if model.world_count > 1 else None
         self._probe = magnetics.probe(np.zeros((len(self.sites), 3)), worlds=worlds)
@@ -79,6 +80,7 @@ class SensorMagnetometer:
         Args:
             state: State with poses ``body_q``. The last :meth:`Magnetics.apply` has set the magnetizations.
         """
+        check_state(state, self._model, "body_q")
         find_sites(state.body_q, self._sites, self._probe.points)
         self._probe.measure()
         read_sites(
@@ -99,9 +101,11 @@ def _find_sites(model: newton.Model, sites) -> list[int]:
     if isinstance(sites, re.Pattern):
         matches = sites.fullmatch
     else:
-        patterns = [sites] if isinstance(sites, str) else list(sites)
+        patterns = [sites] if isinstance(sites, str) else sites
+        if not isinstance(patterns, list | tuple) or not all(isinstance(pattern, str) for pattern in patterns):
+            raise InputError(f"sites: must be patterns of labels or a list of shapes, got {short_repr(sites)}")
         matches = re.compile("|".join(fnmatch.translate(pattern) for pattern in patterns) or r"(?!)").match
-    indices = [index for index, label in enumerate(model.shape_label) if matches(label)]
+    indices = [index for index, label in enumerate(model.shape_label[: model.shape_count]) if matches(label)]
     for index in indices:
         if not flags[index] & newton.ShapeFlags.SITE:
             raise InputError(f"sites: {model.shape_label[index]} is not a site")

@@ -30,7 +30,7 @@ _MODEL_ARRAYS = (
 
 def magnetic_arrays(model: newton.Model) -> dict[str, Any]:
     """Return the arrays that determine the magnets of ``model`` and their forces, by name for messages."""
-    meshes = [getattr(mesh, "vertices", None) for mesh in model.shape_source]
+    meshes = [getattr(mesh, "vertices", None) for mesh in model.shape_source[: model.shape_count]]
     arrays = {name: getattr(model, name) for name in _MODEL_ARRAYS} | {"shape_source": meshes}
     attributes = vars(getattr(model, NAMESPACE)).items()
     arrays |= {f"{NAMESPACE}.{name}": values for name, values in attributes if isinstance(values, wp.array)}

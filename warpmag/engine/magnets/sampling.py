@@ -57,7 +57,8 @@ class ShapeSampler:
 
     def __init__(self, model: newton.Model):
         """Read the geometry of ``model``."""
-        self._labels, self._sources = model.shape_label, model.shape_source
+        # a builder that grows after finalize() appends to the same lists
+        self._labels, self._sources = model.shape_label, model.shape_source[: model.shape_count]
         self._types, self._scales = model.shape_type.numpy(), model.shape_scale.numpy().astype(float)
         self._frames = model.shape_transform.numpy().astype(float)
         numbers = np.column_stack([self._types, _number_sources(self._sources), self._scales, self._frames])

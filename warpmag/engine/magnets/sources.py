@@ -20,7 +20,7 @@ from warpmag.kernels.rigid.sources import (
     gather_sources,
     set_strengths,
 )
-from warpmag.moments.arrays import host_array
+from warpmag.moments.arrays import check_warp_array, host_array
 from warpmag.moments.system import MomentSystem
 
 
@@ -95,8 +95,7 @@ class ModelSources:
             self._matches[selector] = self._matching(name, selector)
         shapes = self._matches[selector]
         if isinstance(value, wp.array):
-            if value.dtype is not wp.float32 or value.ndim != 1 or value.device != self._model.device:
-                raise InputError(f"{name}: must be a Warp array of float32 on {self._model.device}")
+            check_warp_array(name, value, wp.float32, self._model.device)
             values = value
         else:
             numbers = np.atleast_1d(host_array(name, value))

@@ -59,7 +59,7 @@ def body_sizes(model: newton.Model) -> BodySizes:
     shapes = np.flatnonzero((shape_body >= 0) & are_colliding(model))
     shapes = shapes[moving[shape_body[shapes]]]
     bodies = shape_body[shapes]
-    np.minimum.at(thickness, bodies, _thicknesses(types, scales, model.shape_source)[shapes])
+    np.minimum.at(thickness, bodies, _thicknesses(types, scales, model.shape_source[: model.shape_count])[shapes])
     arms = np.linalg.norm(frames[shapes, :3] - centers[bodies], axis=1)
     reaching = (arms > 1e-3 * radii[shapes]) | (types[shapes] != newton.GeoType.SPHERE)
     np.maximum.at(reach, bodies[reaching], (arms + radii[shapes])[reaching])

@@ -10,6 +10,7 @@ import warp as wp
 from warpmag.declarations.checks import short_repr
 from warpmag.declarations.keys import Keys, SceneKeys
 from warpmag.engine.magnets.attributes import NAMESPACE
+from warpmag.engine.magnets.caller_checks import held_by_model
 from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.errors import InputError
 from warpmag.kernels.rigid.keyed_poses import keyed_poses, write_keyed_poses
@@ -92,6 +93,7 @@ class KeyedCurrents:
         Raises:
             InputError: No coil of the model has keys.
         """
+        held_by_model(model)
         texts = getattr(getattr(model, NAMESPACE, None), "current_keys", None) or ()
         keys = {shape: Keys.from_text(text) for shape, text in enumerate(texts) if text}
         if not keys:

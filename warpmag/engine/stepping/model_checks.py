@@ -1,12 +1,11 @@
-"""Checks a model: articulations and stability for its solver, gaps of joints, and the arrays of a control."""
+"""Checks a model: articulations and stability for its solver, and gaps of joints."""
 
 from typing import Any
 
 import newton
 import numpy as np
-import warp as wp
 
-from warpmag.declarations.checks import joint_ends_apart, joint_gap_message, short_repr
+from warpmag.declarations.checks import joint_ends_apart, joint_gap_message
 from warpmag.engine.pile_xpbd.joints import are_pins
 from warpmag.engine.pile_xpbd.solvers import MAXIMAL
 from warpmag.errors import InputError
@@ -36,7 +35,7 @@ def articulate(builder: newton.ModelBuilder, solver: str) -> None:
         articulated.add(child)
 
 
-def check_model(model: newton.Model, solver: str, dt: float) -> None:
+def check_stability(model: newton.Model, solver: str, dt: float) -> None:
     """Raise :class:`InputError` if an initial state is not finite, or the solver is unstable with ``dt`` [s]."""
     _check_joint_springs(model, solver, dt)
     for name, quantity in (("body_q", "position or orientation"), ("body_qd", "velocity")):
@@ -61,19 +60,6 @@ def _check_joint_springs(model: newton.Model, solver: str, dt: float) -> None:
                 f"{model.joint_label[joint]}: a body of the joint is too light for the solver {solver}, whose joints "
                 f"are springs of {SPRING_STIFFNESS:g} N/m and N·m/rad; use another solver"
             )
-
-
-def check_control(control: newton.Control, model: newton.Model) -> None:
-    """Raise :class:`InputError` unless ``control`` fits ``model``."""
-    if not isinstance(control, newton.Control):
-        raise InputError(f"control: must be a newton.Control, got {short_repr(control)}")
-    for name, model_array in vars(model.control()).items():
-        if isinstance(model_array, wp.array):
-            array, kind = getattr(control, name, None), (model_array.shape, model_array.dtype)
-            if not isinstance(array, wp.array) or (array.shape, array.dtype) != kind:
-                raise InputError(f"control: {name} does not fit the model, make one with simulation.model.control()")
-            if array.device != model_array.device:
-                raise InputError(f"control: {name} is on {array.device}, the model is on {model_array.device}")
 
 
 def joint_gaps(model: newton.Model) -> dict[str, float]:

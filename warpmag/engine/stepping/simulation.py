@@ -15,14 +15,14 @@ import warp as wp
 from warpmag.declarations.checks import check_flag, check_positive, short_repr
 from warpmag.declarations.magnets import MagneticSettings
 from warpmag.engine.magnets.attributes import NAMESPACE
+from warpmag.engine.magnets.caller_checks import check_control
 from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.engine.pile_xpbd.contacts import RigidSolver, body_sizes
 from warpmag.engine.pile_xpbd.solvers import SOLVERS, check_solver
 from warpmag.engine.stepping.keyed_values import KeyedModelValues
 from warpmag.engine.stepping.model_checks import (
     articulate,
-    check_control,
-    check_model,
+    check_stability,
     joint_gap_warnings,
     joint_gaps,
 )
@@ -172,7 +172,7 @@ class Simulation:
             errors = newton_errors(str(scene), "use")
         with wp.ScopedDevice(self.device), errors:
             model = builder.finalize(device=self.device, skip_validation_joints=SOLVERS[solver].maximal)
-        check_model(model, solver, LONGEST_SUBSTEP)
+        check_stability(model, solver, LONGEST_SUBSTEP)
         self._joint_gaps = joint_gaps(model) if SOLVERS[solver].maximal else {}
         return model
 

@@ -21,6 +21,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag.engine.magnets.caller_checks import HeldArrays
 from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.engine.pile_xpbd.capture import Workspace, without_allocations
 from warpmag.engine.pile_xpbd.contacts import BodySizes, RigidSolver
@@ -95,6 +96,7 @@ class Stepper:
         self._longest = step / self._min_substeps
         self._state, self._other, self._saved = model.state(), model.state(), model.state()
         self._control = model.control()
+        self._held = {name: HeldArrays(name, getattr(self, f"_{name}")) for name in ("state", "control")}
         self._shared = model.state()  # predicted poses, and forces that several substeps share
         self._machine = stepping.StepMachine(
             _RECORDS, len(solver.buffers), self._device, first_level_substeps=self._min_substeps,
@@ -138,7 +140,7 @@ class Stepper:
 
     @control.setter
     def control(self, control: newton.Control) -> None:
-        self._control = control
+        self._control, self._held["control"] = control, HeldArrays("control", control)
         self._graph, self._warm = None, False
 
     @property
@@ -147,7 +149,12 @@ class Stepper:
         return self.steps - self._reported >= (1 if self._device.is_cpu else _RECORDS)
 
     def advance(self) -> None:
-        """Advance :attr:`state` by one step; does not wait for a GPU."""
+        """Advance :attr:`state` by one step; does not wait for a GPU.
+
+        Replaced arrays of the state or the control raise :class:`InputError`.
+        """
+        for held in self._held.values():
+            held.check()
         if self.steps - self._reported >= _RECORDS:
             raise RuntimeError(f"read_reports() must be called every {_RECORDS} steps")
         self.steps += 1

@@ -1,0 +1,313 @@
+"""States, models, controls and arrays that do not fit: an ``InputError`` that names the argument, for every function.
+
+Kernels do not check bounds. On the code before these checks such calls wrote beyond arrays, and ended the process.
+"""
+
+import re
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from small_builders import add_ball, new_builder
+
+import warpmag
+from warpmag.moments.probe import FieldProbe
+
+M = (0.0, 0.0, 1e6)
+
+
+class World:
+    """A model of a magnet, a conducting ball, iron, a coil on a body and a site, with all that takes its states."""
+
+    def __init__(self, device):
+        self.builder = builder = new_builder()
+        add_ball(builder, (0.0, 0.0, 0.0), M)
+        add_ball(builder, (0.0, 0.0, 0.02))
+        ball = builder.add_body(xform=wp.transform((0.03, 0.0, 0.0), wp.quat_identity()))
+        builder.add_shape_sphere(ball, radius=0.005)
+        warpmag.add_permanent(builder, ball, magnetization=M, conductivity=1e6)
+        warpmag.add_coil(builder, 1, radius=0.01, ampere_turns=1.0, label="coil")
+        builder.add_site(1, label="site")
+        self.model = builder.finalize(device=device)
+        self.magnetics = warpmag.Magnetics(self.model)
+        self.sensor = warpmag.SensorMagnetometer(self.model, self.magnetics, "site")
+        self.viewer = newton.viewer.ViewerNull()
+        self.display = warpmag.Display(self.viewer, self.model, self.magnetics)
+        self.state = self.model.state()
+        self.magnetics.apply(self.state)
+
+    def vectors(self, count, dtype=wp.vec3):
+        return wp.zeros(count, dtype=dtype, device=self.model.device)
+
+
+@pytest.fixture(scope="module")
+def world(device):
+    return World(device)
+
+
+def other_model(device, bodies):
+    builder = new_builder()
+    for number in range(bodies):
+        add_ball(builder, (0.0, 0.0, 0.02 * number), M)
+    return builder.finalize(device=device)
+
+
+OF_STATES = {
+    "Magnetics.apply": lambda world, state: world.magnetics.apply(state),
+    "Magnetics.induce": lambda world, state: world.magnetics.induce(state),
+    "Magnetics.add_forces": lambda world, state: world.magnetics.add_forces(state),
+    "Magnetics.moments_at": lambda world, state: world.magnetics.moments_at(state),
+    "SensorMagnetometer.update": lambda world, state: world.sensor.update(state),
+    "Display.show": lambda world, state: world.display.show(0.0, state),
+    "Display.follow": lambda world, state: world.display.follow(0.0, state),
+}
+
+
+def state_with(**arrays):
+    """A state of the model with other arrays."""
+
+    def make(world):
+        state = world.model.state()
+        for name, array in arrays.items():
+            setattr(state, name, array(world) if callable(array) else array)
+        return state
+
+    return make
+
+
+WRONG_STATES = {
+    "None": lambda _: None,
+    "text": lambda _: "state",
+    "a model": lambda world: world.model,
+    "a control": lambda world: world.model.control(),
+    "of fewer bodies": lambda world: other_model(world.model.device, 1).state(),
+    "of more bodies": lambda world: other_model(world.model.device, 7).state(),
+    "of no bodies": lambda _: newton.State(),
+    "without poses": state_with(body_q=None),
+    "poses on the host": state_with(body_q=np.zeros((3, 7), np.float32)),
+    "poses of another type": state_with(body_q=lambda world: world.vectors(3)),
+    "poses in two dimensions": state_with(body_q=lambda world: wp.zeros((3, 1), dtype=wp.transform)),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG_STATES)
+@pytest.mark.parametrize("name", OF_STATES)
+def test_wrong_state(name, wrong, world):
+    with pytest.raises(warpmag.InputError, match=r"^state: (body_q: )?must be a "):
+        OF_STATES[name](world, WRONG_STATES[wrong](world))
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("name", OF_STATES)
+def test_state_on_another_device(name, world):
+    with pytest.raises(warpmag.InputError, match=r"^state: body_q: must be .* on cuda"):
+        OF_STATES[name](world, other_model("cpu", 3).state())
+
+
+@pytest.mark.parametrize("array", ["body_f", "body_qd"])
+@pytest.mark.parametrize("wrong", [None, 1, 7])
+def test_wrong_forces_and_velocities(array, wrong, world):
+    state = world.model.state()
+    setattr(state, array, None if wrong is None else world.vectors(wrong, wp.spatial_vector))
+    for name in ("Magnetics.apply", "Magnetics.add_forces"):
+        with pytest.raises(warpmag.InputError, match=f"^state: {array}: must be a Warp array of .*\\[3\\]"):
+            OF_STATES[name](world, state)
+
+
+OF_MODELS = {
+    "Magnetics": lambda world, model: warpmag.Magnetics(model),
+    "KeyedCurrents": lambda world, model: warpmag.KeyedCurrents(model),
+    "SensorMagnetometer": lambda world, model: warpmag.SensorMagnetometer(model, world.magnetics, "site"),
+    "Display": lambda world, model: warpmag.Display(world.viewer, model, world.magnetics),
+    "Display.restart": lambda world, model: world.display.restart(model, world.magnetics),
+}
+OF_MAGNETICS = {
+    "SensorMagnetometer": lambda world, value: warpmag.SensorMagnetometer(world.model, value, "site"),
+    "Display": lambda world, value: warpmag.Display(world.viewer, world.model, value),
+    "Display.restart": lambda world, value: world.display.restart(world.model, value),
+}
+
+
+def changed_model(name, count):
+    """A model with an array of another size."""
+
+    def make(world):
+        model = other_model(world.model.device, 3)
+        owner = model.warpmag if name.startswith("warpmag") else model
+        array = getattr(model, name) if owner is model else getattr(owner, name.partition(".")[2])
+        setattr(owner, name.rpartition(".")[2], wp.zeros(count, dtype=array.dtype, device=model.device))
+        return model
+
+    return make
+
+
+WRONG_MODELS = {
+    "None": lambda _: None,
+    "a builder": lambda world: world.builder,
+    "a state": lambda world: world.state,
+    **{
+        f"{name} of {count}": changed_model(name, count)
+        for name in ("body_q", "body_com", "body_flags", "shape_transform", "shape_body", "warpmag.magnetization")
+        for count in (1, 9)
+    },
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG_MODELS)
+@pytest.mark.parametrize("name", OF_MODELS)
+def test_wrong_model(name, wrong, world):
+    with pytest.raises(warpmag.InputError, match=r"^model"):
+        OF_MODELS[name](world, WRONG_MODELS[wrong](world))
+
+
+@pytest.mark.parametrize("name", OF_MAGNETICS)
+@pytest.mark.parametrize("bodies", [None, 1, 3, 7])
+def test_magnetics_of_another_model(name, bodies, world):
+    wrong = None if bodies is None else warpmag.Magnetics(other_model(world.model.device, bodies))
+    with pytest.raises(warpmag.InputError, match="magnetics: "):
+        OF_MAGNETICS[name](world, wrong)
+
+
+@pytest.mark.parametrize("viewer", [None, "gl", newton.viewer.ViewerNull])
+def test_wrong_viewer(viewer, world):
+    with pytest.raises(warpmag.InputError, match="^viewer: "):
+        warpmag.Display(viewer, world.model, world.magnetics)
+
+
+def of_points(name):
+    """Measure at points that replaced those of a probe."""
+
+    def measure(world, points):
+        probe = world.magnetics.probe(np.zeros((3, 3))) if name == "probe" else FieldProbe(world.magnetics.system, 3)
+        probe.points = points
+        probe.measure()
+
+    return measure
+
+
+# arguments of arrays: function, type and size of a right one, and its name
+OF_ARRAYS = {
+    "set_external_field": (lambda world, a: world.magnetics.set_external_field(a), wp.vec3, 1, "external_field"),
+    "set_current": (lambda world, a: world.magnetics.set_current("coil", a), wp.float32, 1, "set_current"),
+    "set_magnetization": (
+        *(lambda world, a: world.magnetics.set_magnetization(a, body=0), wp.vec3, 1, "magnetization"),
+    ),
+    "probe": (lambda world, a: world.magnetics.probe(a), wp.vec3, None, "points"),
+    "h_field": (lambda world, a: world.magnetics.h_field(a), wp.vec3, None, "points"),
+    "b_field": (lambda world, a: world.magnetics.b_field(a), wp.vec3, None, "points"),
+    "field_gradient": (lambda world, a: world.magnetics.field_gradient(a), wp.vec3, None, "points"),
+    "FieldProbe.measure": (of_points("FieldProbe"), wp.vec3, 3, "points"),
+    "Magnetics.probe, points": (of_points("probe"), wp.vec3, 3, "points"),
+    "start_from": (lambda world, a: world.magnetics.start_from(a), None, None, "magnetizations"),
+    "start_from, vector": (lambda world, a: world.magnetics.start_from({0: a}), None, None, "magnetizations: shape 0"),
+}
+WRONG_ARRAYS = {
+    "None": lambda world, dtype: None,
+    "text": lambda world, dtype: "x",
+    "an object": lambda world, dtype: object(),
+    "a ragged list": lambda world, dtype: [[0.0], [0.0, 1.0]],
+    "NaN": lambda world, dtype: np.full((1, 3), np.nan),
+    "of quaternions": lambda world, dtype: wp.zeros(1, dtype=wp.quat, device=world.model.device),
+    "in two dimensions": lambda world, dtype: wp.zeros((1, 1), dtype=dtype or wp.vec3, device=world.model.device),
+}
+WRONG_SIZES = [0, 2, 5, 1000]
+
+
+@pytest.mark.parametrize("wrong", [*WRONG_ARRAYS, *WRONG_SIZES])
+@pytest.mark.parametrize("name", OF_ARRAYS)
+def test_wrong_array(name, wrong, world):
+    call, dtype, count, argument = OF_ARRAYS[name]
+    if isinstance(wrong, int) and count is None and dtype is not None:
+        call(world, world.vectors(wrong, dtype))  # any number of points
+        return
+    array = world.vectors(wrong, dtype or wp.vec3) if isinstance(wrong, int) else WRONG_ARRAYS[wrong](world, dtype)
+    with pytest.raises(warpmag.InputError, match=f"^{re.escape(argument)}: "):
+        call(world, array)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"count": -1}, "count: "),
+        ({"count": 2.5}, "count: "),
+        ({"count": 2, "worlds": [0]}, "worlds: shape must be"),
+        ({"count": 2, "worlds": [0, 0.5]}, "worlds: must be whole"),
+        ({"count": 2, "worlds": [0, 1]}, "worlds: must be 0 to 0"),
+        ({"count": 2, "worlds": ["a", "b"]}, "worlds: "),
+    ],
+)
+def test_wrong_probe(arguments, message, world):
+    with pytest.raises(warpmag.InputError, match=f"^{message}"):
+        FieldProbe(world.magnetics.system, **arguments)
+
+
+@pytest.mark.parametrize("sites", [None, 3, [1.5], [-1], [10**9], [[0]], [None], b"site", {}])
+def test_wrong_sites(sites, world):
+    with pytest.raises(warpmag.InputError, match="^sites: "):
+        warpmag.SensorMagnetometer(world.model, world.magnetics, sites)
+
+
+@pytest.mark.parametrize("flags", [None, "all", 1.5])
+def test_wrong_flags(flags, world):
+    with pytest.raises(warpmag.InputError, match="^flags: "):
+        world.magnetics.notify_model_changed(flags)
+
+
+@pytest.mark.parametrize("array", ["model.body_com", "model.shape_transform", "model.warpmag.magnetization"])
+def test_replaced_array_of_the_model(array, device):
+    model = other_model(device, 2)
+    magnetics, state = warpmag.Magnetics(model), model.state()
+    owner, name = (model.warpmag if "warpmag" in array else model), array.rpartition(".")[2]
+    setattr(owner, name, wp.clone(getattr(owner, name)))
+    for function in (magnetics.apply, magnetics.induce, magnetics.add_forces, magnetics.moments_at):
+        with pytest.raises(warpmag.InputError, match=f"^model.*: {name} is another array than before"):
+            function(state)
+
+
+def simulation_of_two(device):
+    builder = new_builder()
+    for height in (0.0, 0.03):
+        add_ball(builder, (0.0, 0.0, height), M)
+    return warpmag.Simulation(builder, device=device)
+
+
+@pytest.mark.parametrize("count", [1, 2, 9])
+@pytest.mark.parametrize("array", ["state.body_q", "state.body_qd", "state.body_f", "control.joint_f"])
+def test_replaced_array_of_a_simulation(array, count, device):
+    """Captured steps would go on with the earlier array."""
+    simulation = simulation_of_two(device)
+    simulation.step()
+    part, name = array.split(".")
+    owner = getattr(simulation, part)
+    setattr(owner, name, wp.zeros(count, dtype=getattr(owner, name).dtype, device=device))
+    with pytest.raises(warpmag.InputError, match=f"^{part}: {name} is another array"):
+        simulation.step()
+
+
+@pytest.mark.parametrize("wrong", [None, "x", 1, 9])
+def test_wrong_control(wrong, device):
+    simulation = simulation_of_two(device)
+    control = other_model(device, wrong).control() if isinstance(wrong, int) else wrong
+    with pytest.raises(warpmag.InputError, match="^control: "):
+        simulation.control = control
+
+
+def test_builder_that_grows_after_its_model(device):
+    """Newton's models share lists with their builders; forces are those of the model alone."""
+    forces = []
+    for grows in (False, True):
+        builder = new_builder()
+        add_ball(builder, (0.0, 0.0, 0.0), M)
+        add_ball(builder, (0.0, 0.0, 0.02))
+        builder.add_site(0, label="site")
+        model = builder.finalize(device=device)
+        if grows:
+            add_ball(builder, (0.0, 0.0, 0.04), M)
+            builder.add_site(2, label="site of a later body")
+        magnetics, state = warpmag.Magnetics(model), model.state()
+        magnetics.apply(state)
+        assert warpmag.SensorMagnetometer(model, magnetics, "site*").sites == [2]
+        forces.append(state.body_f.numpy())
+    assert np.abs(forces[0]).max() > 0.0
+    np.testing.assert_array_equal(forces[1], forces[0])
