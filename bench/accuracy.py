@@ -172,7 +172,7 @@ def _box_force(half1, half2, offset, device) -> tuple[np.ndarray, int]:
     for half, center in ((half1, np.zeros(3)), (half2, offset)):
         body = builder.add_body(xform=wp.transform(wp.vec3(*center), wp.quat_identity()))
         builder.add_shape_box(body, hx=half[0], hy=half[1], hz=half[2])
-        warpmag.add_permanent(builder, body, magnetization=(0.0, 0.0, MAGNETIZATION))
+        warpmag.add_permanent(builder, body=body, magnetization=(0.0, 0.0, MAGNETIZATION))
     model = builder.finalize(device=device)
     magnetics, state = warpmag.Magnetics(model), model.state()
     state.clear_forces()

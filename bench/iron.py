@@ -93,12 +93,12 @@ def _add(builder: newton.ModelBuilder, body: Body, cells: int) -> None:
     if body.magnetization:
         permeability = 1.0 + body.susceptibility
         recoil = {"recoil_permeability": permeability, "moment_spacing": spacing} if body.susceptibility else {}
-        warpmag.add_permanent(builder, link, magnetization=body.magnetization, **recoil)
+        warpmag.add_permanent(builder, body=link, magnetization=body.magnetization, **recoil)
     elif body.material:
-        warpmag.add_inducible(builder, link, material=body.material, moment_spacing=spacing)
+        warpmag.add_inducible(builder, body=link, material=body.material, moment_spacing=spacing)
     else:
         linear = {"saturation": _UNSATURATED, "susceptibility": body.susceptibility}
-        warpmag.add_inducible(builder, link, moment_spacing=spacing, **linear)
+        warpmag.add_inducible(builder, body=link, moment_spacing=spacing, **linear)
 
 
 def _lengths(vectors: np.ndarray) -> np.ndarray:

@@ -126,7 +126,7 @@ def small_scene(saturation: float = 1e6, worlds: int = 1) -> newton.ModelBuilder
     for k in range(2):
         ball = world.add_body(xform=wp.transform((0.0, 0.0, 0.0102 * k), wp.quat_identity()))
         world.add_shape_sphere(ball, radius=0.005)
-        warpmag.add_inducible(world, ball, saturation=saturation)
+        warpmag.add_inducible(world, body=ball, saturation=saturation)
     builder = newton.ModelBuilder()
     builder.replicate(world, worlds)
     return builder

@@ -21,7 +21,7 @@ def add_ball(builder, position, magnetization=None, rotation=None, **arguments):
     body = builder.add_body(xform=wp.transform(position, rotation), **arguments)
     builder.add_shape_sphere(body, radius=R)
     if magnetization is None:
-        warpmag.add_inducible(builder, body)
+        warpmag.add_inducible(builder, body=body)
     else:
-        warpmag.add_permanent(builder, body, magnetization=magnetization)
+        warpmag.add_permanent(builder, body=body, magnetization=magnetization)
     return body

@@ -183,10 +183,11 @@ def two_shapes():
 MAGNETS = {
     "register_attributes": "builder",
     "add_inducible": "builder body shape material saturation susceptibility curve moment_spacing",
-    "add_permanent": "builder body shape material magnetization recoil_permeability moment_spacing",
+    "add_permanent": "builder body shape material magnetization remanence direction recoil_permeability moment_spacing",
 }
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("name", MAGNETS)
 @given(st.data())
 def test_any_magnet(name, data):
@@ -215,7 +216,7 @@ SETTINGS = "force dynamics contact_model rtol external_field max_evaluations cur
 def magnets(device):
     """A model of an iron ball above a magnet, and its state."""
     builder = two_shapes()
-    warpmag.add_inducible(builder, 0)
+    warpmag.add_inducible(builder, body=0)
     warpmag.add_permanent(builder, shape=1, magnetization=(0.0, 0.0, 1e6), moment_spacing=0.01)
     model = builder.finalize(device=device)
     return model, model.state()
@@ -238,7 +239,7 @@ def test_any_simulation(device, data):
     """What is taken makes a step, after which the ball is somewhere."""
     names = SETTINGS.replace("max_evaluations ", "") + " step solver device graphs visuals scene"
     builder = two_shapes()
-    warpmag.add_inducible(builder, 0)
+    warpmag.add_inducible(builder, body=0)
     with refusals(), contextlib.suppress(warpmag.SimulationError):
         simulation = warpmag.Simulation(**{"scene": builder, "device": device} | chosen(data, names))
         simulation.step()

@@ -83,7 +83,7 @@ def test_model_is_that_of_newtons_own_calls(world, several, permanent):
     for number, (place, turn, radius) in enumerate(zip(places, turns, radii, strict=True)):
         body = one.add_body(xform=wp.transform(place, turn), label=f"ball_{number}")
         one.add_shape_sphere(body, radius=radius, cfg=cfg, color=(0.1, 0.2, 0.3), label=f"ball_{number}_shape")
-        (warpmag.add_permanent if permanent else warpmag.add_inducible)(one, body, **given)
+        (warpmag.add_permanent if permanent else warpmag.add_inducible)(one, body=body, **given)
     added = warpmag.add_balls(
         *(many, places, radii if several else 0.005),
         orientations=turns,
@@ -103,7 +103,7 @@ def test_nothing_said_is_as_newton_has_it():
     for place in places:
         body = one.add_body(xform=wp.transform(place, wp.quat_identity()))
         one.add_shape_sphere(body, radius=0.005, color=(0.5, 0.5, 0.5))
-        warpmag.add_inducible(one, body)
+        warpmag.add_inducible(one, body=body)
     warpmag.add_balls(many, places, 0.005, color=(0.5, 0.5, 0.5))
     _same(_finished(many, False), _finished(one, False))
 

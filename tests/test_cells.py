@@ -346,7 +346,7 @@ def test_a_soft_ellipsoid_turns_with_the_torque_of_the_closed_form(device):
     warpmag.register_attributes(builder)
     body = builder.add_body()
     builder.add_shape_ellipsoid(body, rx=0.01, ry=0.01, rz=0.1)
-    warpmag.add_inducible(builder, body, saturation=FAINT, susceptibility=179.0)
+    warpmag.add_inducible(builder, body=body, saturation=FAINT, susceptibility=179.0)
     model = builder.finalize(device=device)
     across, along = 1.0 / (demagnetizing_factors((1.0, 1.0, 10.0))[[0, 2]] + 1.0 / 179.0)
     volume = 4.0 / 3.0 * math.pi * 1e-5
@@ -374,7 +374,7 @@ def add_needle(builder, rotation, position=(0.0, 0.0, 0.0), body=None, **setting
     body = builder.add_body(xform=wp.transform(position, rotation)) if body is None else body
     frame = wp.transform_identity() if body >= 0 else wp.transform(position, rotation)
     shape = builder.add_shape_box(body, xform=frame, hx=0.005, hy=0.005, hz=0.05)
-    warpmag.add_inducible(builder, body if body >= 0 else None, shape=shape if body < 0 else None, **settings)
+    warpmag.add_inducible(builder, **({"body": body} if body >= 0 else {"shape": shape}), **settings)
     return body
 
 
@@ -418,7 +418,7 @@ def test_bodies_of_one_shape_share_a_table_and_balls_have_none(device):
     warpmag.register_attributes(balls)
     body = balls.add_body()
     balls.add_shape_sphere(body, radius=0.01)
-    warpmag.add_inducible(balls, body)
+    warpmag.add_inducible(balls, body=body)
     assert warpmag.Magnetics(balls.finalize(device=device)).system.rotations is None
 
 

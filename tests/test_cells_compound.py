@@ -67,7 +67,7 @@ def test_a_spacing_larger_than_the_body_is_as_large_as_the_body(spacing):
     magnet = builder.add_body()
     for solid in L_SHAPE:
         builder.add_shape_box(magnet, xform=(solid.position, (0.0, 0.0, 0.0, 1.0)), hx=1.0, hy=1.0, hz=1.0)
-    warpmag.add_inducible(builder, magnet, saturation=1.7e6, moment_spacing=spacing)
+    warpmag.add_inducible(builder, body=magnet, saturation=1.7e6, moment_spacing=spacing)
     (magnet,) = warpmag.Magnetics(builder.finalize(device="cpu")).magnets
     assert np.isfinite(magnet.lattice.coupling.common).all()
 
@@ -107,7 +107,7 @@ def test_shapes_of_one_body_magnetize_as_one(device):
         for k in range(parts):
             frame = wp.transform((0.0, 0.0, 0.05 * (2 * k + 1 - parts)), wp.quat_identity())
             builder.add_shape_box(body, xform=frame, hx=0.01, hy=0.01, hz=0.1 / parts)
-        warpmag.add_inducible(builder, body, saturation=FAINT / 1e3)
+        warpmag.add_inducible(builder, body=body, saturation=FAINT / 1e3)
         model = builder.finalize(device=device)
         magnetics = warpmag.Magnetics(model, external_field=(0.0, 0.0, 1e3))
         magnetics.apply(model.state())

@@ -42,9 +42,9 @@ def add(builder, kind, size, place=(0.0, 0.0, 0.0), turn=UPRIGHT, magnetization=
         )  # Newton corrects the inertia of light bodies with a warning
         builder.add_shape_sphere(body, radius=size[0], cfg=heavy)
     if magnetization is None:
-        warpmag.add_inducible(builder, body)
+        warpmag.add_inducible(builder, body=body)
     else:
-        warpmag.add_permanent(builder, body, magnetization=magnetization)
+        warpmag.add_permanent(builder, body=body, magnetization=magnetization)
     return body
 
 
@@ -370,7 +370,7 @@ def test_a_magnet_of_several_boxes(device):
         for x in (-place, place):
             frame = wp.transform((x, 0.0, 0.0), wp.quat_identity())
             builder.add_shape_box(legs, xform=frame, hx=0.005, hy=0.005, hz=0.01)
-        warpmag.add_permanent(builder, legs, magnetization=ASKEW)
+        warpmag.add_permanent(builder, body=legs, magnetization=ASKEW)
         cube = (*CUBE, (0.001, 0.002, 0.0155))
         add(builder, *cube)
         model = builder.finalize(device=device)

@@ -24,7 +24,7 @@ def test_a_coil_on_a_body_feels_what_it_does(device):
     coil_body = builder.add_body(xform=wp.transform((0.01, 0.02, 0.03), turn))
     builder.add_shape_box(coil_body, xform=wp.transform((0.0, 0.03, 0.0), wp.quat_identity()), hx=R, hy=R, hz=R)
     frame = wp.transform((0.0, 0.01, -0.01), wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), 0.5))
-    warpmag.add_coil(builder, coil_body, radius=A, ampere_turns=800.0, xform=frame)
+    warpmag.add_coil(builder, body=coil_body, radius=A, ampere_turns=800.0, xform=frame)
     balls = [add_ball(builder, (0.0, 0.0, 0.05)), add_ball(builder, (0.02, 0.01, 0.05), (0.0, 3e5, 1e5))]
     model = builder.finalize(device=device)
     magnetics, state = warpmag.Magnetics(model, rtol=1e-5), model.state()
@@ -103,7 +103,7 @@ def test_momentum_of_a_coil_and_a_ball_is_kept_in_a_run(device):
     """Coil and ball attract each other; the ball has fallen well into the coil at the end."""
     builder = new_builder(gravity=(0.0, 0.0, 0.0))
     coil = builder.add_body(mass=0.02, inertia=wp.mat33(*(2e-6 * np.eye(3)).ravel().tolist()), label="coil")
-    warpmag.add_coil(builder, coil, shape="solenoid", radius=A, length=2.0 * HALF, ampere_turns=4000.0)
+    warpmag.add_coil(builder, body=coil, shape="solenoid", radius=A, length=2.0 * HALF, ampere_turns=4000.0)
     ball = add_ball(builder, (0.003, 0.0, 0.05))
     simulation = warpmag.Simulation(builder, step=1e-3, device=device)
     mass, start = simulation.model.body_mass.numpy().astype(float), simulation.state.body_q.numpy()[:, :3].astype(float)
@@ -150,7 +150,7 @@ def test_fixed_bodies_and_fixed_maps(device):
     world = new_builder()
     add_ball(world, (0.0, 0.0, 0.5 * A))
     holder = world.add_body(is_kinematic=True)
-    warpmag.add_coil(world, holder, radius=A, ampere_turns=50.0)
+    warpmag.add_coil(world, body=holder, radius=A, ampere_turns=50.0)
     world.add_site(holder, xform=wp.transform((0.0, 0.0, -0.5 * A), wp.quat_identity()), label="hall")
     builder = new_builder()
     builder.replicate(world, 2)
@@ -281,7 +281,7 @@ def test_sources_that_no_world_or_every_world_would_have(device):
     add_ball(world, (0.0, 0.0, 0.0))
     several = new_builder()
     several.replicate(world, 2)
-    warpmag.add_coil(several, several.add_body(), radius=A, label="free")
+    warpmag.add_coil(several, body=several.add_body(), radius=A, label="free")
     with pytest.raises(warpmag.InputError, match="free: a source on a body outside all worlds"):
         warpmag.Magnetics(several.finalize(device=device))
     outside, lone = new_builder(), new_builder()

@@ -103,7 +103,7 @@ def test_a_compass_needle_swings_about_north(solver, device):
     builder, field, wide = scene(), 40.0, math.radians(40)  # A/m, of the earth
     axis = np.array((0.0, 0.0, 1.0))
     needle, inertia = hinge(builder, wide, axis=tuple(axis))
-    warpmag.add_permanent(builder, needle, magnetization=(4e5, 0.0, 0.0))
+    warpmag.add_permanent(builder, body=needle, magnetization=(4e5, 0.0, 0.0))
     moment = 4e5 * 8.0 * EXTENT.prod()
     simulation = Simulation(builder, solver=solver, device=device, step=STEP, external_field=(field, 0.0, 0.0))
     rate, steps = math.sqrt(MU0 * moment * field / inertia), 220

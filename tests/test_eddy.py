@@ -161,7 +161,7 @@ def _flying_ball(device, saturation, susceptibility, velocity):
     body = builder.add_body()
     builder.add_shape_sphere(body, radius=RADIUS, cfg=newton.ModelBuilder.ShapeConfig(density=8960.0))
     builder.body_qd[body] = wp.spatial_vector(*velocity, 0.0, 0.0, 0.0)
-    warpmag.add_inducible(builder, body, saturation=saturation, susceptibility=susceptibility, conductivity=5.96e7)
+    warpmag.add_inducible(builder, body=body, saturation=saturation, susceptibility=susceptibility, conductivity=5.96e7)
     nodes = np.linspace(-0.1, 0.1, 5)
     values = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), axis=-1) * GRADIENT
     warpmag.add_field_map(builder, (-0.1,) * 3, 0.05, values)
@@ -225,9 +225,11 @@ def _ball_at_a_magnet(motion):
     magnet, ball = (builder.add_body(xform=wp.transform(place, wp.quat_identity())) for place in places)
     builder.add_shape_box(magnet, hx=0.01, hy=0.01, hz=0.01)
     builder.add_shape_sphere(ball, radius=RADIUS)
-    warpmag.add_permanent(builder, magnet, magnetization=(0.0, 2e5, 8e5))
-    warpmag.add_coil(builder, magnet, radius=0.012, ampere_turns=500.0, xform=((0.0, 0.0, 0.01), (0.0, 0.0, 0.0, 1.0)))
-    warpmag.add_inducible(builder, ball, conductivity=1e7)
+    warpmag.add_permanent(builder, body=magnet, magnetization=(0.0, 2e5, 8e5))
+    warpmag.add_coil(
+        builder, body=magnet, radius=0.012, ampere_turns=500.0, xform=((0.0, 0.0, 0.01), (0.0, 0.0, 0.0, 1.0))
+    )
+    warpmag.add_inducible(builder, body=ball, conductivity=1e7)
     for body, place in zip((magnet, ball), places, strict=True):
         velocity, spin = motion(body, place)
         builder.body_qd[body] = wp.spatial_vector(*map(float, velocity), *map(float, spin))
@@ -262,16 +264,16 @@ def test_a_magnet_and_its_coil_move(device):
 
 def test_only_balls_conduct(device):
     builder = _ball_at_a_magnet(lambda body, place: (np.zeros(3), np.zeros(3)))
-    warpmag.add_permanent(builder, 0, magnetization=(0.0, 0.0, 8e5), conductivity=1e6)
+    warpmag.add_permanent(builder, body=0, magnetization=(0.0, 0.0, 8e5), conductivity=1e6)
     with pytest.raises(InputError, match="shape_0: conductivity: only balls"):
         warpmag.Magnetics(builder.finalize(device=device))
     with pytest.raises(InputError, match="conductivity: must be zero or positive"):
-        warpmag.add_inducible(builder, 1, conductivity=-1.0)
+        warpmag.add_inducible(builder, body=1, conductivity=-1.0)
 
 
 def test_nothing_is_prepared_without_conductors(device):
     builder = _ball_at_a_magnet(lambda body, place: (np.zeros(3), np.zeros(3)))
-    warpmag.add_inducible(builder, 1)
+    warpmag.add_inducible(builder, body=1)
     system = warpmag.Magnetics(builder.finalize(device=device)).system
     assert system.eddy is None and system.source_interaction.rates is None
 
@@ -322,7 +324,7 @@ def test_a_ball_that_hangs_stops_to_swing(device):
     place = 1.0005 * (magnet + RADIUS) * np.array([np.sin(start), 0.0, -np.cos(start)])
     ball = builder.add_body(xform=wp.transform((*place[:2], top + place[2]), wp.quat_identity()))
     builder.add_shape_sphere(ball, radius=RADIUS, cfg=smooth)
-    warpmag.add_inducible(builder, ball, conductivity=1e7)
+    warpmag.add_inducible(builder, body=ball, conductivity=1e7)
     simulation, step, angles = warpmag.Simulation(builder, step=1e-3, device=device), 1e-3, []
     for _ in range(500):
         simulation.step()

@@ -109,7 +109,7 @@ def test_a_moment_off_the_centre_of_mass_turns_its_body(device):
     add_ball(builder, (0.0, 0.0, 0.03), (0.0, 0.0, M))
     body = builder.add_body()
     builder.add_shape_sphere(body, radius=R)
-    warpmag.add_permanent(builder, body, magnetization=(0.0, 0.0, M))
+    warpmag.add_permanent(builder, body=body, magnetization=(0.0, 0.0, M))
     arm = 0.02
     counterweight = newton.ModelBuilder.ShapeConfig(density=7000.0)  # seven times the ball's, not magnetic
     builder.add_shape_sphere(body, xform=wp.transform((arm, 0.0, 0.0), wp.quat_identity()), radius=R, cfg=counterweight)
@@ -128,7 +128,7 @@ def box_and_ball(device):
     box = builder.add_body(xform=wp.transform((0.01, -0.02, 0.03), turn))
     pose = wp.transform((0.004, 0.0, 0.0), wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), 0.4))
     builder.add_shape_box(box, xform=pose, hx=0.01, hy=0.006, hz=0.004)
-    warpmag.add_permanent(builder, box, magnetization=(0.3 * M, 0.0, M), moment_spacing=0.004)
+    warpmag.add_permanent(builder, body=box, magnetization=(0.3 * M, 0.0, M), moment_spacing=0.004)
     add_ball(builder, (0.03, -0.01, 0.05), (M, 0.0, 0.0))
     model = builder.finalize(device=device)
     return *wrenches(model), model
@@ -179,7 +179,7 @@ def test_moments_of_one_body_do_not_pull_each_other(device):
     body = builder.add_body()
     for x in (-0.006, 0.006):
         builder.add_shape_sphere(body, xform=wp.transform((x, 0.0, 0.0), wp.quat_identity()), radius=R)
-    warpmag.add_permanent(builder, body, magnetization=(0.0, 0.0, M))
+    warpmag.add_permanent(builder, body=body, magnetization=(0.0, 0.0, M))
     forces, torques, magnetics = wrenches(builder.finalize(device=device))
     assert len(magnetics.system.positions) == 2  # balls apart from each other stay one moment each
     np.testing.assert_array_equal(forces, 0.0)
@@ -192,7 +192,7 @@ def test_overlapping_shapes_of_a_body_are_one_volume(device):
     builder.add_shape_box(body, hx=0.01, hy=0.01, hz=0.01)
     middle = wp.transform((0.01, 0.0, 0.0), wp.quat_identity())
     builder.add_shape_box(body, xform=middle, hx=0.01, hy=0.01, hz=0.01)  # half of it inside the first
-    warpmag.add_permanent(builder, body, magnetization=(0.0, 0.0, M), moment_spacing=0.005)
+    warpmag.add_permanent(builder, body=body, magnetization=(0.0, 0.0, M), moment_spacing=0.005)
     _, _, magnetics = wrenches(builder.finalize(device=device))
     volumes = magnetics.shape_moments()[:, 2] / M
     np.testing.assert_allclose(volumes, [8e-6, 4e-6], rtol=0.02)  # the lattice's test grid knows cuts to 1 %
@@ -301,7 +301,7 @@ def test_every_solid_has_its_volume_as_moment(device, shape):
         builder.add_shape_mesh(body, mesh=cube)
     else:
         builder.add_shape_convex_hull(body, mesh=cube)
-    warpmag.add_permanent(builder, body, magnetization=(0.0, 0.0, M), moment_spacing=0.005)
+    warpmag.add_permanent(builder, body=body, magnetization=(0.0, 0.0, M), moment_spacing=0.005)
     magnetics = warpmag.Magnetics(builder.finalize(device=device))
     assert len(magnetics.system.positions) > 8
     np.testing.assert_allclose(magnetics.shape_volumes, [volume], rtol=1e-5)  # float32 sizes
@@ -315,7 +315,7 @@ def test_meshes_of_the_same_triangles_are_sampled_once(device):
     for k, height in enumerate((1.0, 1.0, 1.5)):
         body = builder.add_body(xform=wp.transform((0.05 * k, 0.0, 0.0)))
         builder.add_shape_mesh(body, mesh=newton.Mesh(corners * [1.0, 1.0, height], faces))
-        warpmag.add_inducible(builder, body, moment_spacing=0.003)
+        warpmag.add_inducible(builder, body=body, moment_spacing=0.003)
     magnetics = warpmag.Magnetics(builder.finalize(device=device))
     one, other, longer = (magnet.lattice for magnet in magnetics.magnets)
     assert one is other

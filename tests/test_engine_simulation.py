@@ -31,7 +31,7 @@ def add_ball(builder, position, velocity=(0.0, 0.0, 0.0), **arguments):
     body = builder.add_body(xform=at(*position), **arguments)
     builder.body_qd[body] = wp.spatial_vector(*velocity, 0.0, 0.0, 0.0)
     builder.add_shape_sphere(body, radius=R)
-    warpmag.add_inducible(builder, body)
+    warpmag.add_inducible(builder, body=body)
     return body
 
 
@@ -93,7 +93,7 @@ def hinged_ball():
     warpmag.register_attributes(builder)
     ball = builder.add_link()
     builder.add_shape_sphere(ball, radius=R)
-    warpmag.add_inducible(builder, ball)
+    warpmag.add_inducible(builder, body=ball)
     builder.add_articulation([builder.add_joint_revolute(-1, ball)])
     return builder
 

@@ -17,9 +17,9 @@ def add_ball(builder, place, velocity=(0.0, 0.0, 0.0), radius=R, magnetization=N
     builder.body_qd[index] = wp.spatial_vector(*velocity, 0.0, 0.0, 0.0)
     builder.add_shape_sphere(index, radius=radius, cfg=newton.ModelBuilder.ShapeConfig(density=7870.0, mu=0.3))
     if magnetization is None:
-        warpmag.add_inducible(builder, index)
+        warpmag.add_inducible(builder, body=index)
     else:
-        warpmag.add_permanent(builder, index, magnetization=magnetization)
+        warpmag.add_permanent(builder, body=index, magnetization=magnetization)
     return index
 
 
@@ -150,7 +150,7 @@ def add_plate(builder, place, velocity=(0.0, 0.0, 0.0), tilt=0.02):
     for x, y in np.ndindex(4, 4):
         at = wp.transform(wp.vec3(0.01 * (x - 1.5), 0.01 * (y - 1.5), 0.0), wp.quat_identity())
         builder.add_shape_box(body, xform=at, hx=0.005, hy=0.005, hz=0.0025, cfg=steel)
-    warpmag.add_inducible(builder, body)
+    warpmag.add_inducible(builder, body=body)
 
 
 def test_plates_of_many_boxes_lie_on_each_other(device):

@@ -89,7 +89,7 @@ def magnetized(device, add_shape, field, *, spacing=0.0, **material):
     warpmag.register_attributes(builder)
     body = builder.add_body()
     add_shape(builder, body)
-    warpmag.add_inducible(builder, body, moment_spacing=spacing, **material)
+    warpmag.add_inducible(builder, body=body, moment_spacing=spacing, **material)
     model = builder.finalize(device=device)
     magnetics = warpmag.Magnetics(model, external_field=tuple(field), rtol=1e-5)
     magnetics.apply(model.state())

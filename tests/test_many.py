@@ -130,9 +130,9 @@ def rods():
         for end in (-1.0, 1.0):
             shape = builder.add_shape_sphere(body, xform=wp.transform((end * RADIUS, 0.0, 0.0)), radius=RADIUS)
             if end > 0.0 and body % 2:
-                warpmag.add_permanent(builder, body, shape=shape, magnetization=(3e5, 2e5, 0.0))
+                warpmag.add_permanent(builder, shape=shape, magnetization=(3e5, 2e5, 0.0))
             else:
-                warpmag.add_inducible(builder, body, shape=shape)
+                warpmag.add_inducible(builder, shape=shape)
     return builder
 
 
@@ -151,7 +151,7 @@ def test_long_bodies_are_right_and_not_chosen(device, monkeypatch):
     body = builder.add_body()
     for place in np.arange(300)[:, None] * [0.006, 0.002, 0.0]:
         shape = builder.add_shape_sphere(body, xform=wp.transform(tuple(place.tolist())), radius=RADIUS)
-        warpmag.add_permanent(builder, body, shape=shape, magnetization=(0.0, 1e6, 0.0))
+        warpmag.add_permanent(builder, shape=shape, magnetization=(0.0, 1e6, 0.0))
     warpmag.add_balls(builder, [[0.0, 0.1, 0.1]], RADIUS, magnetization=(0.0, 0.0, 1e6))
     model = builder.finalize(device=device)
     forces, torques = applied(warpmag.Magnetics(model, method="fmm"), model)

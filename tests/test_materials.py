@@ -50,8 +50,8 @@ def ball(**magnet):
     warpmag.register_attributes(builder)
     body = builder.add_body()
     builder.add_shape_sphere(body, radius=0.005)
-    add = warpmag.add_permanent if "magnetization" in magnet else warpmag.add_inducible
-    add(builder, body, **magnet)
+    add = warpmag.add_permanent if "direction" in magnet else warpmag.add_inducible
+    add(builder, body=body, **magnet)
     return next(iter(marked_shapes(builder.finalize(device="cpu")).values()))
 
 
@@ -59,7 +59,7 @@ def test_bodies_of_named_materials():
     steel = warpmag.material("mild-steel")
     made = ball(material="mild-steel")
     np.testing.assert_allclose((made.saturation, made.susceptibility), (steel.saturation, steel.susceptibility), 1e-6)
-    made = ball(material="N42", magnetization=(0.0, -3.0, 4.0))
+    made = ball(material="N42", direction=(0.0, -3.0, 4.0))
     np.testing.assert_allclose(
         made.magnetization, warpmag.material("N42").magnetization * np.array([0, -0.6, 0.8]), 1e-6
     )
@@ -72,8 +72,8 @@ def test_bodies_of_named_materials():
     [
         ({"material": "adamantium"}, "'adamantium' is no inducible material; known are iron,"),
         ({"material": "N42"}, "'N42' is no inducible material"),
-        ({"material": "iron", "magnetization": (0.0, 0.0, 1.0)}, "'iron' is no permanent material"),
-        ({"material": "N42", "magnetization": (0.0, 0.0, 0.0)}, "must have a direction"),
+        ({"material": "iron", "direction": (0.0, 0.0, 1.0)}, "'iron' is no permanent material"),
+        ({"material": "N42", "direction": (0.0, 0.0, 0.0)}, "direction of its magnetization, got zero"),
         ({"material": "iron", "saturation": 1e6}, "'iron' sets saturation"),
     ],
 )
@@ -130,7 +130,7 @@ def test_a_stage_written_with_the_numbers_reads_the_same():
     [
         ("adamantium", {}, "/Ball: warpmag:material: 'adamantium' is no inducible material"),
         ("iron", PERMANENT, "/Ball: warpmag:material: 'iron' is no permanent material"),
-        ("N52", PERMANENT, "/Ball: warpmag:material: magnetization: must have a direction"),
+        ("N52", PERMANENT, "/Ball: warpmag:material: N52 needs the direction of its magnetization, got zero"),
         (
             "iron",
             {"saturationMagnetization": (Sdf.ValueTypeNames.Float, 1e6)},

@@ -27,9 +27,9 @@ def model_of(device, **material):
         else:
             builder.add_shape_sphere(body, radius=R, label=label)
         if k == 2:
-            warpmag.add_permanent(builder, body, magnetization=(0.0, 0.0, 1e6))
+            warpmag.add_permanent(builder, body=body, magnetization=(0.0, 0.0, 1e6))
         elif k < 2:
-            warpmag.add_inducible(builder, body, **material)
+            warpmag.add_inducible(builder, body=body, **material)
     return builder.finalize(device=device)
 
 
@@ -145,7 +145,7 @@ def test_a_simulation_stops_at_a_model_that_has_changed(device):
     warpmag.register_attributes(builder)
     body = builder.add_body()
     builder.add_shape_sphere(body, radius=R, label="ball")
-    warpmag.add_inducible(builder, body)
+    warpmag.add_inducible(builder, body=body)
     simulation = warpmag.Simulation(builder, device=device)
     simulation.step()
     write(simulation.model, "saturation", 0, 5.0)
@@ -174,7 +174,7 @@ def test_64_worlds_driven_by_a_kernel_in_a_graph(device):
     warpmag.register_attributes(world)
     ball = world.add_body()
     world.add_shape_sphere(ball, radius=R)
-    warpmag.add_inducible(world, ball)
+    warpmag.add_inducible(world, body=ball)
     builder = newton.ModelBuilder()
     warpmag.register_attributes(builder)
     builder.replicate(world, 64)

@@ -198,7 +198,7 @@ def test_magnetization_is_set_in_the_frame_of_the_body(device):
     quarter = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), 0.5 * math.pi)
     body = builder.add_body(xform=wp.transform((0.0, 0.0, 0.0), quarter))
     builder.add_shape_box(body, xform=wp.transform((0.01, 0.0, 0.0), quarter), hx=R, hy=R, hz=R)
-    warpmag.add_permanent(builder, body, magnetization=(0.0, 0.0, M))
+    warpmag.add_permanent(builder, body=body, magnetization=(0.0, 0.0, M))
     ball = add_ball(builder, (0.1, 0.0, 0.0))
     model = builder.finalize(device=device)
     magnetics = warpmag.Magnetics(model)

@@ -32,7 +32,7 @@ def solved(device, half, permeability, field=(0.0, 0.0, 0.0), **settings):
         builder.add_shape_sphere(body, radius=half)
     else:
         builder.add_shape_box(body, hx=half[0], hy=half[1], hz=half[2])
-    warpmag.add_permanent(builder, body, magnetization=tuple(REMANENCE), recoil_permeability=permeability)
+    warpmag.add_permanent(builder, body=body, magnetization=tuple(REMANENCE), recoil_permeability=permeability)
     model = builder.finalize(device=device)
     magnetics = warpmag.Magnetics(model, external_field=field, **settings)
     state = model.state()
@@ -125,8 +125,8 @@ def test_iron_beside_a_magnet_that_responds(device):
         for k, radius in enumerate((0.01, 0.005)):
             body = builder.add_body(xform=wp.transform((0.06 * k, 0.0, 0.0), wp.quat_identity()))
             builder.add_shape_sphere(body, radius=radius)
-        warpmag.add_permanent(builder, 0, magnetization=(0.0, 0.0, 1e6), recoil_permeability=permeability)
-        warpmag.add_inducible(builder, 1)
+        warpmag.add_permanent(builder, body=0, magnetization=(0.0, 0.0, 1e6), recoil_permeability=permeability)
+        warpmag.add_inducible(builder, body=1)
         model = builder.finalize(device=device)
         magnetics = warpmag.Magnetics(model)
         magnetics.apply(model.state())
@@ -200,11 +200,11 @@ def pair(device, permeability, place, turn=STRAIGHT, iron=None):
         body = builder.add_body(xform=wp.transform(where, rotation))
         if iron is not None and body:
             builder.add_shape_sphere(body, radius=iron)
-            warpmag.add_inducible(builder, body)
+            warpmag.add_inducible(builder, body=body)
             continue
         builder.add_shape_box(body, hx=0.005, hy=0.005, hz=0.005)
         settings = {"recoil_permeability": permeability, "moment_spacing": 0.002}
-        warpmag.add_permanent(builder, body, magnetization=(0.0, 0.0, 1e6), **settings)
+        warpmag.add_permanent(builder, body=body, magnetization=(0.0, 0.0, 1e6), **settings)
     model = builder.finalize(device=device)
     magnetics, state = warpmag.Magnetics(model, rtol=1e-5), model.state()
     magnetics.apply(state)

@@ -134,7 +134,7 @@ def test_a_chain_of_magnets_lies_still(device):
     for k in range(5):
         body = builder.add_body(xform=wp.transform((2.0 * R * k, 0.0, R)))
         builder.add_shape_sphere(body, radius=R, cfg=material(0.5))
-        warpmag.add_permanent(builder, body, magnetization=(8e5, 0.0, 1e5))
+        warpmag.add_permanent(builder, body=body, magnetization=(8e5, 0.0, 1e5))
     simulation = warpmag.Simulation(builder, device=device)
     before = step(simulation, 0.2)
     assert np.abs(step(simulation, 0.5) - before).max() < 1e-3 * R
@@ -151,7 +151,7 @@ def test_bodies_that_were_put_into_each_other_come_apart_slowly(mu, hinged, devi
     for x, half in ((0.0, R), (1.2 * R, 1.3 * R)):
         body = builder.add_body(xform=wp.transform((x, 0.1 * R, 0.2 * R)))
         builder.add_shape_box(body, hx=half, hy=half, hz=half, cfg=material(mu))
-    warpmag.add_inducible(builder, 0)
+    warpmag.add_inducible(builder, body=0)
     if hinged:
         place = wp.transform((100.0 * R, 0.0, 0.0))
         link = builder.add_link(xform=place)

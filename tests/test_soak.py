@@ -29,7 +29,7 @@ def magnets():
         ball = builder.add_body(xform=wp.transform(position, wp.normalize(wp.quat(*turn))))
         density = MASS / (4.0 / 3.0 * np.pi * RADIUS**3)
         builder.add_shape_sphere(ball, radius=RADIUS, cfg=newton.ModelBuilder.ShapeConfig(density=density, mu=0.3))
-        warpmag.add_permanent(builder, ball, magnetization=(0.0, 0.0, M))
+        warpmag.add_permanent(builder, body=ball, magnetization=(0.0, 0.0, M))
     return builder
 
 

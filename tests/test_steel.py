@@ -359,7 +359,7 @@ def builder_with(**magnet):
     for k in range(2):
         body = builder.add_body(xform=wp.transform((0.011 * k, 0.0, 0.0), wp.quat_identity()))
         builder.add_shape_sphere(body, radius=0.005)
-        warpmag.add_inducible(builder, body, **(magnet if k else {}))
+        warpmag.add_inducible(builder, body=body, **(magnet if k else {}))
     return builder
 
 

@@ -20,8 +20,8 @@ def simulate(path: str) -> None:
 
 def build(builder: newton.ModelBuilder, solver: SolverXPBD, state: newton.State) -> None:
     warpmag.register_custom_attributes(builder)
-    warpmag.add_inducible(builder, 0, material="iron")
-    warpmag.add_permanent(builder, 1, magnetization=(0.0, 0.0, 1e6))
+    warpmag.add_inducible(builder, body=0, material="iron")
+    warpmag.add_permanent(builder, body=1, magnetization=(0.0, 0.0, 1e6))
     assert_type(warpmag.add_coil(builder, radius=0.05, ampere_turns=100.0), int)
     magnetics = warpmag.Magnetics(builder.finalize(), force="kelvin")
     assert_type(magnetics.apply(state), None)

@@ -17,6 +17,7 @@ from warpmag.engine.stepping.simulation import Simulation as Simulation
 from warpmag.errors import ConvergenceWarning as ConvergenceWarning
 from warpmag.errors import InputError as InputError
 from warpmag.errors import SimulationError as SimulationError
+from warpmag.errors import UnitWarning as UnitWarning
 from warpmag.moments.fields import h_field as h_field
 from warpmag.moments.fields import wrench as wrench
 from warpmag.moments.induction import InductionResult as InductionResult

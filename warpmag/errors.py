@@ -37,3 +37,7 @@ class SimulationError(RuntimeError):
 
 class ConvergenceWarning(UserWarning):
     """An induction solve that ended before it reached its tolerance."""
+
+
+class UnitWarning(UserWarning):
+    """A valid value that was likely meant in another unit."""

@@ -48,7 +48,7 @@ def fall(count: int, dt: float, device, *, force: str = "kelvin") -> Fall:
     for center in BALLS[:count]:
         body = builder.add_body(xform=wp.transform(wp.vec3(*center), wp.quat_identity()))
         builder.add_shape_sphere(body, radius=RADIUS, cfg=newton.ModelBuilder.ShapeConfig(density=DENSITY))
-        warpmag.add_inducible(builder, body)
+        warpmag.add_inducible(builder, body=body)
     model = builder.finalize(device=device)
     magnetics = warpmag.Magnetics(model, external_field=tuple(FIELD), rtol=2e-6, force=force)
     # XPBD sets speeds below 0.1 mm/s to zero, so with short steps balls would never start to move

@@ -7,9 +7,10 @@ Densities are rounded values from Bozorth's table and makers' data sheets.
 """
 
 import math
+import warnings
 from dataclasses import dataclass
 
-from warpmag.declarations.checks import short_repr
+from warpmag.declarations.checks import check_positive, check_vector, short_repr
 from warpmag.declarations.curves import MU0, MagnetizationCurve
 from warpmag.declarations.magnets import check_curve
 from warpmag.declarations.measured import MEASURED_CURVES
@@ -156,6 +157,38 @@ def name_of_curve(curve: MagnetizationCurve) -> str | None:
     return next((entry.name for entry in MATERIALS.values() if entry.curve == curve), None)
 
 
+def magnetization_from(magnetization, remanence, material, direction) -> tuple[float, float, float]:
+    """Return the magnetization [A/m] of the arguments of :func:`warpmag.add_permanent`; exactly one sets the strength.
+
+    The direction of a material as ``magnetization``, as in version 0.1, causes a DeprecationWarning.
+    """
+    if material is not None and direction is None and magnetization is not None:
+        message = f"material: its direction is an argument of its own now, direction={short_repr(magnetization)}"
+        warnings.warn(message, DeprecationWarning, stacklevel=4)
+        magnetization, direction = None, magnetization
+    strengths = {"magnetization": magnetization, "remanence": remanence, "material": material}
+    given = [name for name, value in strengths.items() if value is not None]
+    if len(given) != 1:
+        got = " and ".join(given) if given else "none"
+        raise InputError(f"magnetization, remanence, material: give one of them, got {got}")
+    if magnetization is not None:
+        if direction is not None:
+            raise InputError("direction: goes with remanence or material; magnetization has its own")
+        check_vector("magnetization", magnetization)
+        return magnetization
+    if direction is None:
+        raise InputError(f"direction: {given[0]} needs the direction of the magnetization")
+    check_vector("direction", direction)
+    if material is not None:
+        return permanent("material", material, direction)
+    check_positive("remanence", remanence)
+    length = math.hypot(*direction)
+    if not length > 0.0:
+        raise InputError("direction: must not be zero")
+    x, y, z = (remanence / MU0 / length * component for component in direction)
+    return x, y, z
+
+
 def permanent(owner: str, name: str, direction: tuple[float, float, float]) -> tuple[float, float, float]:
     """Return the magnetization [A/m] of a permanent material along a direction of any length.
 
@@ -164,7 +197,7 @@ def permanent(owner: str, name: str, direction: tuple[float, float, float]) -> t
     entry = _look_up(owner, name, "permanent")
     length = math.hypot(*direction)
     if not (length > 0.0 and math.isfinite(length)):
-        raise InputError(f"{owner}: magnetization: must have a direction, in which {name} is magnetized")
+        raise InputError(f"{owner}: {name} needs the direction of its magnetization, got zero")
     x, y, z = (entry.magnetization * component / length for component in direction)
     return x, y, z
 

@@ -47,7 +47,7 @@ class Example:
         self.gripper = self.add_arm(builder)
         self.ball = builder.add_body(xform=wp.transform((*START, RADIUS), wp.quat_identity()))
         builder.add_shape_sphere(self.ball, radius=RADIUS, cfg=hard, custom_attributes=ROLLING)
-        warpmag.add_inducible(builder, self.ball, material="1010-steel")
+        warpmag.add_inducible(builder, body=self.ball, material="1010-steel")
 
         self.model = builder.finalize()
         self.magnetics = warpmag.Magnetics(self.model)
@@ -84,7 +84,7 @@ class Example:
         coil = wp.transform((0.0, 0.0, 0.0065), wp.quat_identity())
         winding = newton.ModelBuilder.ShapeConfig(density=2000.0, has_shape_collision=False)
         builder.add_shape_cylinder(slide, xform=coil, radius=COIL["radius"], half_height=0.005, cfg=winding)
-        warpmag.add_coil(builder, slide, xform=coil, **COIL)
+        warpmag.add_coil(builder, body=slide, xform=coil, **COIL)
         end = wp.transform((LINK, 0.0, PAD + 0.0005 - HEIGHT), wp.quat_identity())
         drive = {"target_ke": STIFFNESS, "target_kd": 20.0}
         joints.append(builder.add_joint_prismatic(parent, slide, parent_xform=end, axis=upright, **drive))

@@ -29,7 +29,7 @@ class Example:
             center = 2.005 * RADIUS * (np.array((x, y)) - 0.5 * (args.columns - 1))
             ball = builder.add_body(xform=wp.transform((*center, (2.005 * z + 1.0) * RADIUS), wp.quat_identity()))
             builder.add_shape_sphere(ball, radius=RADIUS, cfg=iron)
-            warpmag.add_inducible(builder, ball, saturation=1.7e6)
+            warpmag.add_inducible(builder, body=ball, saturation=1.7e6)
         above = wp.transform((0.0, 0.0, HEIGHT), wp.quat_identity())
         half = 0.5 * MAGNET
         cube = builder.add_shape_box(-1, xform=above, hx=half, hy=half, hz=half, cfg=iron)

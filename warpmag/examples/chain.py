@@ -28,7 +28,7 @@ class Example:
         rotor = builder.add_link()
         bar = wp.transform((ARM, 0.0, RADIUS), wp.quat_identity())
         builder.add_shape_box(rotor, xform=bar, hx=RADIUS, hy=HALF_LENGTH, hz=0.9 * RADIUS, cfg=smooth)
-        warpmag.add_permanent(builder, rotor, magnetization=(0.0, 2e5, 0.0))
+        warpmag.add_permanent(builder, body=rotor, magnetization=(0.0, 2e5, 0.0))
         motor = builder.add_joint_revolute(
             -1, rotor, axis=(0.0, 0.0, 1.0), target_qd=SPEED, target_kd=GAIN,
             actuator_mode=newton.JointTargetMode.VELOCITY,
@@ -38,7 +38,7 @@ class Example:
             distance = HALF_LENGTH + (2 * number + 1) * 1.001 * RADIUS
             ball = builder.add_body(xform=wp.transform((ARM, -distance, RADIUS), wp.quat_identity()))
             builder.add_shape_sphere(ball, radius=RADIUS, cfg=smooth)
-            warpmag.add_permanent(builder, ball, magnetization=(0.0, 2e5, 0.0))
+            warpmag.add_permanent(builder, body=ball, magnetization=(0.0, 2e5, 0.0))
 
         self.simulation = warpmag.Simulation(builder, step=1e-3)
         self.display = warpmag.Display(viewer, self.simulation.model, self.simulation.magnetics)

@@ -36,7 +36,9 @@ class Example:
             needle = row.add_link(xform=pose)
             row.add_shape_box(needle, hx=EXTENT[0], hy=EXTENT[1], hz=EXTENT[2])
             # one moment is enough for needles so far away; the default would be 252
-            warpmag.add_permanent(row, needle, magnetization=(MAGNETIZATION, 0.0, 0.0), moment_spacing=2.0 * EXTENT[0])
+            warpmag.add_permanent(
+                row, body=needle, magnetization=(MAGNETIZATION, 0.0, 0.0), moment_spacing=2.0 * EXTENT[0]
+            )
             hinge = row.add_joint_revolute(
                 -1, needle, parent_xform=pose, axis=(0.0, 0.0, 1.0), target_kd=self.damping,
                 actuator_mode=newton.JointTargetMode.VELOCITY,

@@ -46,7 +46,7 @@ class Example:
             # the density of the plastic in the same place is added
             heavy = newton.ModelBuilder.ShapeConfig(density=6300.0, mu=0.02, mu_torsional=0.0)
             shape = builder.add_shape_box(body, xform=pole, hx=POLE, hy=POLE, hz=POLE, cfg=heavy)
-            warpmag.add_permanent(builder, shape=shape, material="N42", magnetization=(side, 0.0, 0.0))
+            warpmag.add_permanent(builder, shape=shape, material="N42", direction=(side, 0.0, 0.0))
 
     @staticmethod
     def create_parser():

@@ -42,7 +42,7 @@ class Example:
             builder.add_shape_sphere(ball, radius=RADIUS, cfg=metal)
             (self.steel if steel else self.brass).append(ball)
             if steel:
-                warpmag.add_inducible(builder, ball, material="1010-steel")
+                warpmag.add_inducible(builder, body=ball, material="1010-steel")
 
         self.simulation = warpmag.Simulation(builder, step=1e-3)
         self.coils = args.coils

@@ -41,7 +41,7 @@ class Example:
         iron = newton.ModelBuilder.ShapeConfig(density=DENSITY)
         ball = world.add_body(xform=wp.transform((0.0, 0.0, RADIUS), wp.quat_identity()))
         world.add_shape_sphere(ball, radius=RADIUS, cfg=iron)
-        warpmag.add_inducible(world, ball)
+        warpmag.add_inducible(world, body=ball)
         above = wp.transform((0.0, 0.0, COIL_HEIGHT), wp.quat_identity())
         warpmag.add_coil(world, shape="solenoid", radius=COIL_RADIUS, length=COIL_LENGTH, xform=above, label="coil")
         plate = wp.transform((0.0, 0.0, 0.0145), wp.quat_identity())

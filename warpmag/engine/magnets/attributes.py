@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.declarations.attributes import NAMESPACE, Attribute, attributes_of
-from warpmag.declarations.checks import check_whole, short_repr
+from warpmag.declarations.checks import short_repr
 from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.magnets import CURVES, KINDS, Magnet
 from warpmag.errors import InputError
@@ -65,13 +65,6 @@ def check_registered(builder: newton.ModelBuilder) -> None:
     check_builder(builder)
     if f"{NAMESPACE}:source" not in builder.custom_attributes:
         raise InputError("builder: call warpmag.register_custom_attributes(builder) before magnets are added")
-
-
-def check_index(name: str, index: int, count: int, noun: str) -> None:
-    """Raise :class:`InputError` unless ``index`` is in ``range(count)``; ``noun`` names the builder's objects."""
-    check_whole(name, index)
-    if not 0 <= index < count:
-        raise InputError(f"{name}: {short_repr(index)} is out of range, the builder has {count} {noun}")
 
 
 def mark_shapes(builder: newton.ModelBuilder, shapes: range | list[int], magnet: Magnet) -> None:

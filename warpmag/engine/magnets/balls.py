@@ -12,6 +12,7 @@ import warp as wp
 from warpmag.declarations import materials
 from warpmag.declarations.checks import check_not_negative, check_positive, check_vector
 from warpmag.declarations.curves import MagnetizationCurve
+from warpmag.declarations.likely_units import warn_of_magnetization, warn_of_radius
 from warpmag.declarations.magnets import Magnet
 from warpmag.engine.magnets.attributes import check_registered, mark_shapes
 from warpmag.errors import InputError
@@ -51,6 +52,8 @@ def add_balls(
     susceptibility: float | None = None,
     curve: str | MagnetizationCurve | None = None,
     magnetization: tuple[float, float, float] | None = None,
+    remanence: float | None = None,
+    direction: tuple[float, float, float] | None = None,
     recoil_permeability: float = 1.0,
     color: tuple[float, float, float] | None = None,
     label: str | None = None,
@@ -67,13 +70,13 @@ def add_balls(
         orientations: Rotations, unit quaternions x y z w, shape [n, 4]; by default the identity.
         density: Density [kg/m³].
         friction: Coefficient of friction [dimensionless].
-        material: Name of a material of :mod:`warpmag.declarations.materials`: inducible, or permanent with
-            ``magnetization``.
+        material: Name of a material of :mod:`warpmag.declarations.materials`: inducible, or permanent with a
+            ``direction``.
         saturation: Saturation magnetization Ms [A/m], 1.7e6 by default.
         susceptibility: Susceptibility χ [dimensionless], infinite by default.
         curve: Magnetization curve, see :func:`add_inducible`.
-        magnetization: Magnetization M [A/m] in the frame of each ball. If given, the balls are permanent magnets. With
-            ``material`` only its direction counts.
+        magnetization, remanence, direction: Magnetization in the frame of each ball, see :func:`add_permanent`. If
+            given, the balls are permanent magnets.
         recoil_permeability: Recoil permeability, see :func:`add_permanent`.
         color: Color of all balls, RGB from 0 to 1; by default a color of Newton's palette.
         label: Prefix of labels, before ``_`` and the number of the ball; by default Newton's labels.
@@ -91,8 +94,14 @@ def add_balls(
     count = len(poses)
     radii = _radii(radius, count)
     response = {"saturation": saturation, "susceptibility": susceptibility, "curve": curve}
-    magnet = _magnet(material, response, magnetization, recoil_permeability)
+    permanent = {"magnetization": magnetization, "remanence": remanence, "direction": direction}
+    vector = None
+    if any(value is not None for value in permanent.values()):
+        vector = materials.magnetization_from(material=material, **permanent)
+        warn_of_magnetization(math.hypot(*vector))
+    magnet = _magnet(material, response, vector, recoil_permeability)
     magnet.check("add_balls")
+    warn_of_radius("add_balls", float(radii.max(initial=0.0)))
     balls = _next_balls(builder, count)
     if count:
         config = _config(builder, density, friction)
@@ -204,9 +213,6 @@ def _magnet(material, response: dict, magnetization, recoil_permeability: float)
         return Magnet("inducible", **materials.inducible_from(material, curve, fields))
     if fields:
         raise InputError(f"{next(iter(fields))}: for inducible magnets only, but magnetization makes permanent magnets")
-    check_vector("magnetization", magnetization)
-    if material is not None:
-        magnetization = materials.permanent("material", material, magnetization)
     return Magnet("permanent", magnetization=tuple(magnetization), recoil_permeability=recoil_permeability)
 
 

@@ -1,5 +1,6 @@
 """Adds magnets to Newton builders: inducible and permanent materials of bodies and shapes."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -8,10 +9,11 @@ import numpy as np
 import warp as wp
 
 from warpmag.declarations import materials
-from warpmag.declarations.checks import check_vector, check_whole
 from warpmag.declarations.curves import MagnetizationCurve
+from warpmag.declarations.likely_units import warn_of_magnetization, warn_of_radius
 from warpmag.declarations.magnets import Magnet
-from warpmag.engine.magnets.attributes import check_index, check_registered, mark_shapes
+from warpmag.engine.magnets.attributes import check_registered, mark_shapes
+from warpmag.engine.magnets.selection import body_by_keyword, selected
 from warpmag.errors import InputError
 
 _SOLID = [
@@ -21,24 +23,27 @@ _SOLID = [
 """Types of shapes with a volume."""
 
 
+@body_by_keyword
 def add_inducible(
     builder: newton.ModelBuilder,
-    body: int = -1,
     *,
-    shape: int | None = None,
+    body: int | str | None = None,
+    shape: int | str | None = None,
     material: str | None = None,
     saturation: float | None = None,
     susceptibility: float | None = None,
     curve: str | MagnetizationCurve | None = None,
     moment_spacing: float = 0.0,
     conductivity: float = 0.0,
-) -> None:
-    """Make a body, or one shape, a magnet that the field magnetizes: iron, steel, ferrite.
+) -> list[int]:
+    """Make bodies, or single shapes, magnets that the field magnetizes: iron, steel, ferrite.
 
     Args:
         builder: The builder, with :func:`register_custom_attributes` called on it.
-        body: The body. All its colliding shapes, which must exist already, become one magnet.
-        shape: One shape in place of all shapes of the body, for example a static shape.
+        body: Index, label or pattern of labels of bodies, such as ``"gripper"`` or ``"*/ball_*"``. A label may be given
+            without the part up to its last ``/``. All colliding shapes of a body, which must exist already, become one
+            magnet.
+        shape: Index, label or pattern of shapes, in place of ``body``: single shapes, for example static ones.
         material: Name of an inducible material of :mod:`warpmag.declarations.materials`. It replaces ``saturation`` and
             ``susceptibility``, and ``curve`` if the material has a measured curve.
         saturation: Saturation magnetization Ms [A/m], 1.7e6 by default.
@@ -52,54 +57,82 @@ def add_inducible(
             a conductor that moves through the field. 0 means no eddy currents. ``material`` does not set it, since eddy
             currents cost a sum over pairs; :class:`warpmag.declarations.materials.Material` lists values.
 
+    Returns:
+        Indices of the shapes that became magnets.
+
     Raises:
-        InputError: The attributes are not declared, body or shape do not exist or have no volume, or a value is out
-            of range.
+        InputError: The attributes are not declared, not exactly one of ``body`` and ``shape`` is given, nothing or
+            several objects have the label, the shapes have no volume, or a value is out of range.
+
+    Warns:
+        UnitWarning: A ball is so large that its radius is likely in another unit.
+
+    Example:
+        >>> add_inducible(builder, body="*/ball_*", material="iron")  # doctest: +SKIP
     """
     numbers = {"saturation": saturation, "susceptibility": susceptibility}
     values = materials.inducible_from(material, curve, {k: v for k, v in numbers.items() if v is not None})
     magnet = Magnet("inducible", **values, moment_spacing=moment_spacing, conductivity=conductivity)
-    shapes = magnet_shapes(builder, body, shape)
+    shapes = magnet_shapes(builder, body=body, shape=shape)
     magnet.check(builder.shape_label[shapes[0]])
+    warn_of_radius("add_inducible", _largest_ball(builder, shapes))
     mark_shapes(builder, shapes, magnet)
+    return shapes
 
 
+@body_by_keyword
 def add_permanent(
     builder: newton.ModelBuilder,
-    body: int = -1,
     *,
-    shape: int | None = None,
+    body: int | str | None = None,
+    shape: int | str | None = None,
+    magnetization: tuple[float, float, float] | None = None,
+    remanence: float | None = None,
     material: str | None = None,
-    magnetization: tuple[float, float, float],
+    direction: tuple[float, float, float] | None = None,
     recoil_permeability: float = 1.0,
     moment_spacing: float = 0.0,
     conductivity: float = 0.0,
-) -> None:
-    """Make a body, or one shape, a permanent magnet.
+) -> list[int]:
+    """Make bodies, or single shapes, permanent magnets.
+
+    The strength is one of three: ``magnetization``, or ``remanence`` or ``material`` with a ``direction``.
 
     Args:
         builder: The builder, with :func:`register_custom_attributes` called on it.
-        body: The body. All its colliding shapes, which must exist already, become one magnet.
-        shape: One shape in place of all shapes of the body, for example a static shape.
-        material: Name of a permanent material of :mod:`warpmag.declarations.materials`, which sets the strength.
-        magnetization: Magnetization M [A/m] in the frame of the body, or of a static shape. With ``material`` only
-            its direction counts.
+        body: Index, label or pattern of labels of bodies, see :func:`add_inducible`. All colliding shapes of a body
+            become one magnet.
+        shape: Index, label or pattern of shapes, in place of ``body``: single shapes, for example static ones.
+        magnetization: Magnetization M [A/m] in the frame of the body, or of a static shape.
+        remanence: Remanence Br [T] of a data sheet, M = Br/μ0.
+        material: Name of a permanent material of :mod:`warpmag.declarations.materials`, such as ``"N42"``.
+        direction: Direction of the magnetization for ``remanence`` and ``material``, of any length, in the frame of the
+            body, or of a static shape.
         recoil_permeability: μ of M = M_r + (μ − 1) H [dimensionless], with the internal field H and ``magnetization``
             M_r: about 1.05 for NdFeB, 1.1 for ferrite. At 1, the default, no field changes M. Above 1 the induction
             solve includes the magnet.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
         conductivity: Electrical conductivity [S/m], see :func:`add_inducible`.
 
+    Returns:
+        Indices of the shapes that became magnets.
+
     Raises:
-        InputError: The attributes are not declared, body or shape do not exist or have no volume, or a value is out
-            of range.
+        InputError: The attributes are not declared, not exactly one of ``body`` and ``shape`` or of the three strengths
+            is given, nothing or several objects have the label, the shapes have no volume, or a value is out of range.
+
+    Warns:
+        UnitWarning: The magnetization is none of a real magnet, or a ball is so large that its radius is likely in
+            another unit.
+
+    Example:
+        >>> add_permanent(builder, body="gripper", remanence=1.3, direction=(0.0, 0.0, 1.0))  # doctest: +SKIP
     """
-    check_vector("magnetization", magnetization)
-    if material is not None:
-        magnetization = materials.permanent("material", material, magnetization)
+    vector = materials.magnetization_from(magnetization, remanence, material, direction)
     values = {"moment_spacing": moment_spacing, "conductivity": conductivity}
-    magnet = Magnet("permanent", magnetization=magnetization, recoil_permeability=recoil_permeability, **values)
-    for index in magnet_shapes(builder, body, shape):
+    magnet = Magnet("permanent", magnetization=vector, recoil_permeability=recoil_permeability, **values)
+    shapes = magnet_shapes(builder, body=body, shape=shape)
+    for index in shapes:
         rotation = wp.quat_identity()
         if builder.shape_body[index] >= 0:
             frame: Any = builder.shape_transform[index]  # Newton annotates a tuple, but it is a transform
@@ -107,6 +140,15 @@ def add_permanent(
         rotated = in_shape_frame(magnet, rotation)
         rotated.check(builder.shape_label[index])
         mark_shapes(builder, [index], rotated)
+    warn_of_magnetization(math.hypot(*vector))
+    warn_of_radius("add_permanent", _largest_ball(builder, shapes))
+    return shapes
+
+
+def _largest_ball(builder: newton.ModelBuilder, shapes: list[int]) -> float:
+    """Return the largest radius [m] of the balls among shapes, 0 without one."""
+    balls = [shape for shape in shapes if builder.shape_type[shape] == newton.GeoType.SPHERE]
+    return max((builder.shape_scale[ball][0] for ball in balls), default=0.0)
 
 
 def in_shape_frame(magnet: Magnet, rotation: wp.quat) -> Magnet:
@@ -124,24 +166,29 @@ def axis_rotation(axis: str | None) -> Any:
     return newton.math.quat_between_axes(newton.Axis.Z, newton.Axis.from_any(axis)) if axis else wp.quat_identity()
 
 
-def magnet_shapes(builder: newton.ModelBuilder, body: int, shape: int | None = None) -> list[int]:
-    """Return the shapes of a magnet on ``body``, or on ``shape`` alone; no solid shape raises :class:`InputError`."""
+def magnet_shapes(builder: newton.ModelBuilder, *, body: int | str | None = None, shape=None) -> list[int]:
+    """Return the shapes of magnets on bodies, or single shapes; :class:`InputError` where one has no volume."""
     check_registered(builder)
-    if shape is not None:
-        check_index("shape", shape, builder.shape_count, "shapes")
-        check_whole("body", body)
-        if body not in (-1, builder.shape_body[shape]):
-            raise InputError(f"shape: {builder.shape_label[shape]} belongs to body {builder.shape_body[shape]}")
-        if builder.shape_type[shape] not in _SOLID:
-            kind = newton.GeoType(builder.shape_type[shape]).name.lower()
-            raise InputError(f"{builder.shape_label[shape]}: a {kind} has no volume to magnetize")
-        return [shape]
-    check_index("body", body, builder.body_count, "bodies")
-    shapes = [
-        index
-        for index in builder.body_shapes[body]
-        if builder.shape_flags[index] & newton.ShapeFlags.COLLIDE_SHAPES and builder.shape_type[index] in _SOLID
-    ]
-    if not shapes:
-        raise InputError(f"{builder.body_label[body]}: has no colliding solid shape yet, add its shapes first")
+    if (body is None) == (shape is None):
+        raise InputError(f"body, shape: give one of them, got {'none' if body is None else 'both'}")
+    if body is None:
+        return [_solid(builder, index) for index in selected("shape", shape, builder.shape_label, "shapes")]
+    shapes = []
+    for index in selected("body", body, builder.body_label, "bodies"):
+        colliding = [
+            number
+            for number in builder.body_shapes[index]
+            if builder.shape_flags[number] & newton.ShapeFlags.COLLIDE_SHAPES and builder.shape_type[number] in _SOLID
+        ]
+        if not colliding:
+            raise InputError(f"{builder.body_label[index]}: has no colliding solid shape yet, add its shapes first")
+        shapes += colliding
     return shapes
+
+
+def _solid(builder: newton.ModelBuilder, shape: int) -> int:
+    """Return ``shape``; raise :class:`InputError` unless it has a volume."""
+    if builder.shape_type[shape] not in _SOLID:
+        kind = newton.GeoType(builder.shape_type[shape]).name.lower()
+        raise InputError(f"{builder.shape_label[shape]}: a {kind} has no volume to magnetize")
+    return shape

@@ -14,7 +14,8 @@ import warp as wp
 from warpmag.declarations.attributes import NAMESPACE
 from warpmag.declarations.checks import check_whole, short_repr
 from warpmag.declarations.coils import LARGEST_POINT, Coil, FieldMap, SourceRecord, checked_vectors
-from warpmag.engine.magnets.attributes import check_index, check_registered
+from warpmag.engine.magnets.attributes import check_registered
+from warpmag.engine.magnets.selection import body_by_keyword, selected
 from warpmag.errors import InputError
 from warpmag.moments.arrays import host_array
 
@@ -22,10 +23,11 @@ _UNIT_TOLERANCE = 1e-3
 """Largest deviation of a quaternion's norm from 1; components are often rounded to few digits."""
 
 
+@body_by_keyword
 def add_coil(
     builder: newton.ModelBuilder,
-    body: int = -1,
     *,
+    body: int | str = -1,
     shape: str = "loop",
     radius: float = 0.0,
     length: float = 0.0,
@@ -44,7 +46,7 @@ def add_coil(
 
     Args:
         builder: The builder, with :func:`warpmag.register_custom_attributes` called on it.
-        body: The body; -1 for a coil fixed in the world.
+        body: Index or label of the body; -1 for a coil fixed in the world.
         shape: ``loop``, ``solenoid`` or ``polyline``.
         radius: Radius of a loop or a solenoid [m].
         length: Length of a solenoid [m]; its middle is the origin.
@@ -61,7 +63,7 @@ def add_coil(
         The shape that represents the coil, a site.
 
     Raises:
-        InputError: The attributes are not declared, the body does not exist, or a value is out of range.
+        InputError: The attributes are not declared, not exactly one body is selected, or a value is out of range.
     """
     corners = ()
     if points is not None:
@@ -77,7 +79,7 @@ def add_field_map(
     spacing: npt.ArrayLike,
     values: npt.ArrayLike,
     *,
-    body: int = -1,
+    body: int | str = -1,
     factor: float = 1.0,
     xform: wp.transform | tuple | None = None,
     label: str | None = None,
@@ -93,7 +95,7 @@ def add_field_map(
         origin: Position of the first node [m], in the frame of the map.
         spacing: Distance between nodes [m], one number or one along each axis.
         values: Field H at the nodes [A/m], shape [nx, ny, nz, 3], at least two along each axis, NumPy.
-        body: The body; -1 for a map fixed in the world.
+        body: Index or label of the body; -1 for a map fixed in the world.
         factor: Factor on the field; :meth:`warpmag.Magnetics.set_current` changes it.
         xform: Pose of the map in the frame of the body, or in the world.
         label: Label of the map.
@@ -102,7 +104,7 @@ def add_field_map(
         The shape that represents the map, a site.
 
     Raises:
-        InputError: The attributes are not declared, the body does not exist, or a value is out of range.
+        InputError: The attributes are not declared, not exactly one body is selected, or a value is out of range.
     """
     name = "add_field_map"
     nodes, steps = host_array(f"{name}: values", values), host_array(f"{name}: spacing", spacing)
@@ -133,20 +135,35 @@ def add_placed_source(
 
 
 def _add_source(
-    builder: newton.ModelBuilder, body: int, record: SourceRecord, strength: float, xform, kind: str, label, keys=""
+    builder: newton.ModelBuilder,
+    body: int | str,
+    record: SourceRecord,
+    strength: float,
+    xform,
+    kind: str,
+    label,
+    keys="",
 ) -> int:
     """Add a source to a body or to the world; return its site. The default label is ``kind`` with a number."""
     check_registered(builder)
     label = f"{kind}_{builder.shape_count}" if label is None else label
-    check_whole("body", body)
-    if body != -1:
-        check_index("body", body, builder.body_count, "bodies")
+    if not isinstance(body, str):
+        check_whole("body", body)
+    number = -1 if body == -1 else _single_body(builder, body)
     if not isinstance(label, str):
         raise InputError(f"label: must be text, got {short_repr(label)}")
     frame = wp.transform() if xform is None else _checked_frame("xform", xform)
     values = {f"{NAMESPACE}:source": record.to_text(), f"{NAMESPACE}:strength": float(strength)}
     values[f"{NAMESPACE}:current_keys"] = keys
-    return builder.add_site(body, xform=frame, label=label, custom_attributes=values)
+    return builder.add_site(number, xform=frame, label=label, custom_attributes=values)
+
+
+def _single_body(builder: newton.ModelBuilder, body: int | str) -> int:
+    """Return the index of the only body that an argument selects, else raise :class:`InputError`."""
+    bodies = selected("body", body, builder.body_label, "bodies")
+    if len(bodies) > 1:
+        raise InputError(f"body: {short_repr(body)} matches {len(bodies)} bodies, a source has one")
+    return bodies[0]
 
 
 def _checked_frame(name: str, xform) -> wp.transform:

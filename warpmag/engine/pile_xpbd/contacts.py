@@ -135,11 +135,13 @@ class RigidSolver:
         self._limits = {
             "contact": max(16, int(capacity * contacts)),
             "pair": max(16, int(capacity * _PAIRS_PER_SHAPE * len(types))),
-            "triangle": None,  # Newton's estimate
+            "triangle": None,  # Newton's estimate; before Newton 1.8 its default
         }
         self._allocate()
 
     def _allocate(self) -> None:
+        limit = self._limits["triangle"]
+        triangles = {} if limit is None else {"max_triangle_pairs": limit}  # Newton before 1.8 refuses None
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             self._pipeline = newton.CollisionPipeline(
@@ -148,7 +150,7 @@ class RigidSolver:
                 speculative_contact_gap_max=self._speculation,
                 rigid_contact_max=self._limits["contact"],
                 shape_pairs_max=self._limits["pair"],
-                max_triangle_pairs=self._limits["triangle"],
+                **triangles,
                 deterministic=self._sorts_contacts(),
                 include_static_kinematic_pairs=False,  # these contacts move nothing
                 verify_buffers=False,  # would only print; the stepper reads the counters

@@ -180,9 +180,9 @@ def _mark_magnets(
     shapes_of_magnets = {}
     for prim, magnet in magnets.items():
         if prim in bodies:
-            shapes_of_magnets[prim] = magnet_shapes(builder, bodies[prim])
+            shapes_of_magnets[prim] = magnet_shapes(builder, body=bodies[prim])
         elif prim in shapes:
-            shapes_of_magnets[prim] = magnet_shapes(builder, -1, shapes[prim])
+            shapes_of_magnets[prim] = magnet_shapes(builder, shape=shapes[prim])
         else:
             raise InputError(f"{prim}: Newton imports neither body nor shape of this magnet")
         shapes_of_magnets[prim] = builder.with_original_meshes(shapes_of_magnets[prim])
