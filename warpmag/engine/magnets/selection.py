@@ -12,7 +12,8 @@ from warpmag.errors import InputError
 
 _WILDCARDS = "*?["
 _MOST_LISTED = 3  # labels in a message
-Parameters, Result = ParamSpec("Parameters"), TypeVar("Result")
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
 
 
 def body_by_keyword(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
@@ -21,6 +22,8 @@ def body_by_keyword(function: Callable[Parameters, Result]) -> Callable[Paramete
     By position an index of a shape passed for that of a body, and another shape became the magnet.
     """
 
+    call = cast(Any, function)
+
     @wraps(function)
     def with_body(builder, *positions, **values):
         if positions:
@@ -28,7 +31,7 @@ def body_by_keyword(function: Callable[Parameters, Result]) -> Callable[Paramete
             message = f"{name}: name the body, {name}(builder, body={short_repr(positions[0])}, ...)"
             warnings.warn(message, DeprecationWarning, stacklevel=2)
             values = {"body": positions[0], **values}
-        return function(builder, *positions[1:], **values)
+        return call(builder, *positions[1:], **values)
 
     return cast(Any, with_body)
 
