@@ -5,6 +5,7 @@ import math
 import newton
 import numpy as np
 import pytest
+import warp as wp
 
 import warpmag
 from warpmag.engine.magnets.attributes import marked_shapes
@@ -157,3 +158,44 @@ def test_a_ball_of_a_meter_warns(builder, add):
 @pytest.mark.parametrize("magnetization", [0.0, 1e3, 1e5, 1.2e6, 2e6])
 def test_magnets_as_they_are_warn_of_nothing(builder, magnetization):
     warpmag.add_permanent(builder, body="cube", magnetization=(0.0, 0.0, magnetization))
+
+
+def masses(**shape_config):
+    """Builder of a ball, a box away from its body's origin, and a body of two shapes."""
+    builder = newton.ModelBuilder()
+    warpmag.register_custom_attributes(builder)
+    config = newton.ModelBuilder.ShapeConfig(**shape_config)
+    frame = wp.transform((0.01, 0.02, 0.03), wp.quat_rpy(0.1, 0.2, 0.3))
+    builder.add_shape_sphere(builder.add_body(label="ball"), radius=0.005, cfg=config)
+    builder.add_shape_box(builder.add_body(label="box"), xform=frame, hx=0.01, hy=0.02, hz=0.03, cfg=config)
+    both = builder.add_body(label="both")
+    builder.add_shape_sphere(both, radius=0.005, cfg=config)
+    builder.add_shape_box(both, xform=frame, hx=0.01, hy=0.02, hz=0.03, cfg=config)
+    return builder
+
+
+def test_a_named_material_gives_the_density_that_nobody_gave():
+    """Mass, inertia and center of mass are those that Newton computes from the density."""
+    density = warpmag.material("1010-steel").density
+    builder, expected = masses(), masses(density=density)
+    warpmag.add_inducible(builder, body="*", material="1010-steel")
+    for name in ("body_mass", "body_inv_mass", "body_inertia", "body_inv_inertia", "body_com"):
+        values, wanted = (np.array(getattr(of, name), float) for of in (builder, expected))
+        # float32; products of inertia that vanish are rounding of the moments of inertia
+        np.testing.assert_allclose(values, wanted, rtol=1e-5, atol=1e-6 * np.abs(wanted).max())
+    balls = warpmag.add_balls(builder, [[0.0, 0.0, 1.0]], 0.005, material="1010-steel")
+    assert builder.body_mass[balls.bodies[0]] == pytest.approx(builder.body_mass[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("material", [{"material": "N42", "direction": UP}, {"magnetization": (0.0, 0.0, 1e6)}])
+def test_a_density_that_somebody_gave_stays(material):
+    given = {} if "magnetization" in material else {"density": 2000.0}
+    builder, expected = masses(**given), masses(**given)
+    warpmag.add_permanent(builder, body="*", **material)
+    assert builder.body_mass == expected.body_mass
+
+
+def test_a_part_of_a_body_does_not_change_its_mass():
+    builder, expected = masses(), masses()
+    warpmag.add_inducible(builder, shape=2, material="iron")
+    assert builder.body_mass == expected.body_mass

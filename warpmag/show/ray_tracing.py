@@ -20,8 +20,8 @@ from typing import Any
 import newton
 import numpy as np
 import warp as wp
-from newton.sensors import SensorCamera
 
+from warpmag.engine.newton_versions import camera_type
 from warpmag.engine.stepping.scene import ImportedScene, import_scene
 from warpmag.errors import InputError
 from warpmag.moments.arrays import resolve_device
@@ -109,10 +109,11 @@ class _Renderer:
         self._arrows = _Arrows(scene, path) if moments else None
         self._model = model = scene.builder.finalize()
         self._state = model.state()
-        self._camera = camera = SensorCamera(model, load_textures=False)
+        ray_tracer = camera_type()
+        self._camera = camera = ray_tracer(model, load_textures=False)
         camera.create_default_light(direction=wp.normalize(wp.vec3(*_SUN)))
         camera.set_ambient_light(*_AMBIENT)
-        self._config = SensorCamera.RenderConfig(enable_shadows=True)
+        self._config = ray_tracer.RenderConfig(enable_shadows=True)
         self._bodies = list(scene.bodies)
         self._rows = np.array([scene.bodies[prim] for prim in self._bodies], dtype=int)
         self._albedo = _to_linear(model.shape_color.numpy())
@@ -194,14 +195,14 @@ class _Arrows:
         model.shape_transform.assign(frames)
 
 
-def _view(scene: ImportedScene, model: newton.Model, camera: SensorCamera, width: int, height: int) -> tuple[Any, Any]:
+def _view(scene: ImportedScene, model: newton.Model, camera: Any, width: int, height: int) -> tuple[Any, Any]:
     """Return the rays in the frame of the camera, shape [height, width, 1, 2, 3], and the pose of the camera."""
     prim = first_camera(scene.stage)
     if prim:
-        rays: Any = SensorCamera.compute_camera_rays_pinhole_usd(width, height, prim, device="cpu")
+        rays: Any = camera.compute_camera_rays_pinhole_usd(width, height, prim, device="cpu")
         return rays.numpy(), wp.transform(*camera.compute_camera_transforms_usd(prim).numpy()[0])
     field = min(_FIELD_OF_VIEW, 2.0 * math.atan(math.tan(0.5 * _FIELD_OF_VIEW) * height / width))
-    rays = SensorCamera.compute_camera_rays_pinhole(width, height, camera_fov=field, device="cpu")
+    rays = camera.compute_camera_rays_pinhole(width, height, camera_fov=field, device="cpu")
     return rays.numpy(), _looking_at_bodies(model, field)
 
 

@@ -15,6 +15,7 @@ from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.likely_units import warn_of_magnetization, warn_of_radius
 from warpmag.declarations.magnets import Magnet
 from warpmag.engine.magnets.attributes import check_registered, mark_shapes
+from warpmag.engine.newton_versions import add_copies
 from warpmag.errors import InputError
 from warpmag.moments.arrays import host_array, host_radii, host_scalars, shape_message
 from warpmag.terminal import collection_paused
@@ -68,7 +69,8 @@ def add_balls(
         positions: Centers [m], shape [n, 3].
         radius: Radius [m], one number or shape [n].
         orientations: Rotations, unit quaternions x y z w, shape [n, 4]; by default the identity.
-        density: Density [kg/m³].
+        density: Density [kg/m³]; by default that of ``builder.default_shape_cfg``, or of ``material`` if that is
+            Newton's default.
         friction: Coefficient of friction [dimensionless].
         material: Name of a material of :mod:`warpmag.declarations.materials`: inducible, or permanent with a
             ``direction``.
@@ -104,7 +106,7 @@ def add_balls(
     warn_of_radius("add_balls", float(radii.max(initial=0.0)))
     balls = _next_balls(builder, count)
     if count:
-        config = _config(builder, density, friction)
+        config = _config(builder, density, friction, material)
         _add_copies(builder, _template(builder, radii[0], config, color), count)
         _place(builder, poses)
         _resize(builder, radii, config)
@@ -191,9 +193,11 @@ def _radii(radius, count: int) -> np.ndarray:
     return radii
 
 
-def _config(builder: newton.ModelBuilder, density, friction) -> newton.ModelBuilder.ShapeConfig:
-    """Return the builder's shape configuration with the given density and friction."""
+def _config(builder: newton.ModelBuilder, density, friction, material) -> newton.ModelBuilder.ShapeConfig:
+    """Return the builder's shape configuration with the given density and friction, or a material's density."""
     config = builder.default_shape_cfg.copy()
+    if material is not None and config.density == newton.ModelBuilder.ShapeConfig().density:
+        config.density = materials.material(material).density
     if density is not None:
         check_positive("density", density)
         config.density = float(density)
@@ -240,9 +244,9 @@ def _add_copies(builder: newton.ModelBuilder, template: newton.ModelBuilder, cou
     """
     row_length = math.isqrt(count)
     row = _empty_like(template)
-    row.replicate(template, row_length, separate_worlds=False)
-    builder.replicate(row, count // row_length, separate_worlds=False)
-    builder.replicate(template, count % row_length, separate_worlds=False)
+    add_copies(row, template, row_length)
+    add_copies(builder, row, count // row_length)
+    add_copies(builder, template, count % row_length)
 
 
 def _place(builder: newton.ModelBuilder, poses: np.ndarray) -> None:

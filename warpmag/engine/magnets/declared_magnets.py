@@ -13,6 +13,7 @@ from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.likely_units import warn_of_magnetization, warn_of_radius
 from warpmag.declarations.magnets import Magnet
 from warpmag.engine.magnets.attributes import check_registered, mark_shapes
+from warpmag.engine.magnets.body_mass import give_density
 from warpmag.engine.magnets.selection import body_by_keyword, selected
 from warpmag.errors import InputError
 
@@ -45,7 +46,8 @@ def add_inducible(
             magnet.
         shape: Index, label or pattern of shapes, in place of ``body``: single shapes, for example static ones.
         material: Name of an inducible material of :mod:`warpmag.declarations.materials`. It replaces ``saturation`` and
-            ``susceptibility``, and ``curve`` if the material has a measured curve.
+            ``susceptibility``, and ``curve`` if the material has a measured curve. A body whose mass follows from
+            Newton's default density gets the material's.
         saturation: Saturation magnetization Ms [A/m], 1.7e6 by default.
         susceptibility: Susceptibility χ [dimensionless], infinite by default.
         curve: Magnetization curve: one of ``magnets.CURVES``, ``tanh`` by default, or a measured curve: a
@@ -77,6 +79,8 @@ def add_inducible(
     magnet.check(builder.shape_label[shapes[0]])
     warn_of_radius("add_inducible", _largest_ball(builder, shapes))
     mark_shapes(builder, shapes, magnet)
+    if material is not None:
+        give_density(builder, shapes, materials.material(material).density)
     return shapes
 
 
@@ -105,7 +109,8 @@ def add_permanent(
         shape: Index, label or pattern of shapes, in place of ``body``: single shapes, for example static ones.
         magnetization: Magnetization M [A/m] in the frame of the body, or of a static shape.
         remanence: Remanence Br [T] of a data sheet, M = Br/μ0.
-        material: Name of a permanent material of :mod:`warpmag.declarations.materials`, such as ``"N42"``.
+        material: Name of a permanent material of :mod:`warpmag.declarations.materials`, such as ``"N42"``. A body whose
+            mass follows from Newton's default density gets the material's.
         direction: Direction of the magnetization for ``remanence`` and ``material``, of any length, in the frame of the
             body, or of a static shape.
         recoil_permeability: μ of M = M_r + (μ − 1) H [dimensionless], with the internal field H and ``magnetization``
@@ -142,6 +147,8 @@ def add_permanent(
         mark_shapes(builder, [index], rotated)
     warn_of_magnetization(math.hypot(*vector))
     warn_of_radius("add_permanent", _largest_ball(builder, shapes))
+    if material is not None:
+        give_density(builder, shapes, materials.material(material).density)
     return shapes
 
 

@@ -11,6 +11,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag.engine.newton_versions import triangle_limit
 from warpmag.engine.pile_xpbd.broad_phase import NeighborBroadPhase, are_colliding
 from warpmag.engine.pile_xpbd.solvers import SOLVERS, check_solver
 from warpmag.engine.pile_xpbd.xpbd import PileXPBD
@@ -140,8 +141,6 @@ class RigidSolver:
         self._allocate()
 
     def _allocate(self) -> None:
-        limit = self._limits["triangle"]
-        triangles = {} if limit is None else {"max_triangle_pairs": limit}  # Newton before 1.8 refuses None
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             self._pipeline = newton.CollisionPipeline(
@@ -150,7 +149,7 @@ class RigidSolver:
                 speculative_contact_gap_max=self._speculation,
                 rigid_contact_max=self._limits["contact"],
                 shape_pairs_max=self._limits["pair"],
-                **triangles,
+                **triangle_limit(self._limits["triangle"]),
                 deterministic=self._sorts_contacts(),
                 include_static_kinematic_pairs=False,  # these contacts move nothing
                 verify_buffers=False,  # would only print; the stepper reads the counters

@@ -21,6 +21,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag.engine.newton_versions import has_tendons
 from warpmag.engine.pile_xpbd.broad_phase import are_colliding
 from warpmag.engine.pile_xpbd.joints import JointSolve
 from warpmag.kernels.contacts import solve as contact_solve
@@ -57,7 +58,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
             self._shares = wp.ones(model.body_count, dtype=float, device=model.device)
             self._split_masses = wp.empty_like(model.body_inv_mass), wp.empty_like(model.body_inv_inertia)
         self._contact_iterations = contact_iterations or self.iterations
-        newton_only = model.particle_count, model.tendon_segment_count, self.enable_restitution
+        newton_only = model.particle_count, has_tendons(model), self.enable_restitution
         self._solve = self._joints = self._free_dofs = None
         plain = not any(newton_only) and not self.rigid_contact_con_weighting
         if plain and (free_dofs := _free_dofs(model)) is not None:

@@ -1,0 +1,37 @@
+"""Differences between the versions of Newton that warpmag runs with: 1.6.1, which Isaac Lab 3.0 needs, to 1.8."""
+
+import inspect
+from typing import Any
+
+import newton
+
+from warpmag.errors import InputError
+
+
+def add_copies(builder: newton.ModelBuilder, template: newton.ModelBuilder, count: int) -> None:
+    """Add copies of a builder to the current world of another one."""
+    if "separate_worlds" in inspect.signature(newton.ModelBuilder.replicate).parameters:
+        builder.replicate(template, count, separate_worlds=False)
+        return
+    for _ in range(count):  # earlier versions make a world of each copy
+        builder.add_builder(template)
+
+
+def triangle_limit(most: int | None) -> dict[str, int]:
+    """Return the argument of ``newton.CollisionPipeline`` that limits pairs of triangles; None for Newton's default."""
+    return {} if most is None else {"max_triangle_pairs": most}  # None is an argument from 1.8 on
+
+
+def has_tendons(model: newton.Model) -> bool:
+    """Return True if a model has tendons, which versions before 1.8 do not know."""
+    return getattr(model, "tendon_segment_count", 0) > 0
+
+
+def camera_type() -> Any:
+    """Return Newton's ray tracer; versions without it raise :class:`InputError`."""
+    try:
+        from newton.sensors import SensorCamera  # noqa: PLC0415
+    except ImportError:
+        version = newton.__version__
+        raise InputError(f"pictures: need Newton 1.8, which has a ray tracer of its own; this is {version}") from None
+    return SensorCamera
