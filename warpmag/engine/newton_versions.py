@@ -27,6 +27,11 @@ def has_tendons(model: newton.Model) -> bool:
     return getattr(model, "tendon_segment_count", 0) > 0
 
 
+def has_moving_surfaces(contacts: newton.Contacts) -> bool:
+    """Return True if surfaces move along contacts, which versions before 1.8 do not know."""
+    return getattr(contacts, "rigid_contact_surface_velocity", None) is not None
+
+
 def camera_type() -> Any:
     """Return Newton's ray tracer; versions without it raise :class:`InputError`."""
     try:

@@ -21,7 +21,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.engine.newton_versions import has_tendons
+from warpmag.engine.newton_versions import has_moving_surfaces, has_tendons
 from warpmag.engine.pile_xpbd.broad_phase import are_colliding
 from warpmag.engine.pile_xpbd.joints import JointSolve
 from warpmag.kernels.contacts import solve as contact_solve
@@ -73,7 +73,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
 
     def step(self, state_in, state_out, control, contacts, dt, *, observables=None) -> None:
         """Advance by ``dt`` [s]; takes the arguments of Newton's solver."""
-        if self._solve is not None and contacts.rigid_contact_surface_velocity is None:
+        if self._solve is not None and not has_moving_surfaces(contacts):
             self._step_bodies(state_in, state_out, control, contacts, dt)
             return
         if self._joints is not None:
