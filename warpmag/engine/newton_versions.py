@@ -27,6 +27,11 @@ def has_tendons(model: newton.Model) -> bool:
     return getattr(model, "tendon_segment_count", 0) > 0
 
 
+def has_joint_kernels(solver: newton.solvers.SolverXPBD) -> bool:
+    """Return True if a solver has the joints of 1.8, whose kernels warpmag launches; and no mimic joints."""
+    return not getattr(solver, "_has_joint_mimics", True)
+
+
 def has_moving_surfaces(contacts: newton.Contacts) -> bool:
     """Return True if surfaces move along contacts, which versions before 1.8 do not know."""
     return getattr(contacts, "rigid_contact_surface_velocity", None) is not None

@@ -21,7 +21,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.engine.newton_versions import has_moving_surfaces, has_tendons
+from warpmag.engine.newton_versions import has_joint_kernels, has_moving_surfaces, has_tendons
 from warpmag.engine.pile_xpbd.broad_phase import are_colliding
 from warpmag.engine.pile_xpbd.joints import JointSolve
 from warpmag.kernels.contacts import solve as contact_solve
@@ -41,7 +41,8 @@ class PileXPBD(newton.solvers.SolverXPBD):
 
     * rigid bodies without joints, or with free joints only: ``kernels.contacts.solve``;
     * other joints: :mod:`warpmag.engine.pile_xpbd.joints`;
-    * particles, tendons, restitution, moving surfaces, mimic joints: Newton's own step, with split masses.
+    * particles, tendons, restitution, moving surfaces, mimic joints, and joints in Newton before 1.8: Newton's own
+      step, with split masses.
     """
 
     def __init__(self, model: newton.Model, contact_max: int, *, contact_iterations: int | None = None, **settings):
@@ -66,7 +67,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
             self._solve = contact_solve.allocate(contact_max, bodies, kinematic_flag=_KINEMATIC)
             if model.joint_count:
                 self._free_dofs = wp.array(free_dofs, dtype=wp.int32, device=model.device)
-        elif plain and not self._has_joint_mimics:
+        elif plain and has_joint_kernels(self):
             relaxations = {"contact_relaxation": self.rigid_contact_relaxation}
             relaxations["joint_relaxation"] = self.joint_linear_relaxation
             self._joints = JointSolve(model, contact_max, iterations=self.iterations, **relaxations)
