@@ -4,6 +4,7 @@ import inspect
 from typing import Any
 
 import newton
+import warp as wp
 
 from warpmag.errors import InputError
 
@@ -35,6 +36,12 @@ def has_joint_kernels(solver: newton.solvers.SolverXPBD) -> bool:
 def has_moving_surfaces(contacts: newton.Contacts) -> bool:
     """Return True if surfaces move along contacts, which versions before 1.8 do not know."""
     return getattr(contacts, "rigid_contact_surface_velocity", None) is not None
+
+
+def lost_contacts(contacts: newton.Contacts) -> wp.array | None:
+    """Return the counter of contacts of meshes lost during reduction, shape [1]; None where none is counted."""
+    counters = contacts.contact_counters
+    return counters[2:3] if counters.shape[0] > 2 else None  # two counters before 1.8
 
 
 def camera_type() -> Any:

@@ -11,7 +11,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.engine.newton_versions import triangle_limit
+from warpmag.engine.newton_versions import lost_contacts, triangle_limit
 from warpmag.engine.pile_xpbd.broad_phase import NeighborBroadPhase, are_colliding
 from warpmag.engine.pile_xpbd.solvers import SOLVERS, check_solver
 from warpmag.engine.pile_xpbd.xpbd import PileXPBD
@@ -175,10 +175,9 @@ class RigidSolver:
             Buffer("contact", self.contacts.rigid_contact_count, self.contacts.rigid_contact_max),
         ]
         if narrow.triangle_pairs is not None:
-            self.buffers += [
-                Buffer("triangle", narrow.triangle_pairs_count, narrow.triangle_pairs.shape[0]),
-                Buffer("triangle", self.contacts.contact_counters[2:3], 0),  # contacts lost during reduction
-            ]
+            self.buffers.append(Buffer("triangle", narrow.triangle_pairs_count, narrow.triangle_pairs.shape[0]))
+            if (lost := lost_contacts(self.contacts)) is not None:
+                self.buffers.append(Buffer("triangle", lost, 0))
         if (overflow_flags := getattr(self._solver, "constraint_overflow", None)) is not None:
             self.buffers.append(Buffer("contact", overflow_flags, 0))
 

@@ -72,8 +72,8 @@ class PileXPBD(newton.solvers.SolverXPBD):
             relaxations["joint_relaxation"] = self.joint_linear_relaxation
             self._joints = JointSolve(model, contact_max, iterations=self.iterations, **relaxations)
 
-    def step(self, state_in, state_out, control, contacts, dt, *, observables=None) -> None:
-        """Advance by ``dt`` [s]; takes the arguments of Newton's solver."""
+    def step(self, state_in, state_out, control, contacts, dt, **options) -> None:
+        """Advance by ``dt`` [s]; takes the arguments of Newton's solver, and ``options`` of its own step."""
         if self._solve is not None and not has_moving_surfaces(contacts):
             self._step_bodies(state_in, state_out, control, contacts, dt)
             return
@@ -82,7 +82,7 @@ class PileXPBD(newton.solvers.SolverXPBD):
             return
         self._find_shares(self._view_bodies(state_in), contacts, dt)
         with self._splitting():
-            super().step(state_in, state_out, control, contacts, dt, observables=observables)
+            super().step(state_in, state_out, control, contacts, dt, **options)
 
     def persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays that the next substep depends on, by name."""
