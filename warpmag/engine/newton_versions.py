@@ -28,6 +28,16 @@ def has_tendons(model: newton.Model) -> bool:
     return getattr(model, "tendon_segment_count", 0) > 0
 
 
+def reverse_targets(builder: newton.ModelBuilder, joint: int, axis: int) -> None:
+    """Reverse position and velocity that a joint's drive tends to along its axis, whose degree of freedom is ``axis``."""
+    if hasattr(builder, "joint_target_q"):
+        builder.joint_target_qd[axis] *= -1.0
+        builder.joint_target_q[builder.joint_q_start[joint]] *= -1.0
+        return
+    for name in ("joint_target_vel", "joint_target_pos"):  # before 1.8
+        getattr(builder, name)[axis] *= -1.0
+
+
 def has_joint_kernels(solver: newton.solvers.SolverXPBD) -> bool:
     """Return True if a solver has the joints of 1.8, whose kernels warpmag launches; and no mimic joints."""
     return not getattr(solver, "_has_joint_mimics", True)
@@ -40,7 +50,7 @@ def has_moving_surfaces(contacts: newton.Contacts) -> bool:
 
 def lost_contacts(contacts: newton.Contacts) -> wp.array | None:
     """Return the counter of contacts of meshes lost during reduction, shape [1]; None where none is counted."""
-    counters = contacts.contact_counters
+    counters: Any = contacts.contact_counters
     return counters[2:3] if counters.shape[0] > 2 else None  # two counters before 1.8
 
 

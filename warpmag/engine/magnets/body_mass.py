@@ -33,7 +33,7 @@ def give_density(builder: newton.ModelBuilder, shapes: list[int], density: float
 
 def _scale_mass(builder: newton.ModelBuilder, body: int, factor: float) -> None:
     """Multiply the mass and the inertia of a body."""
-    builder.body_mass[body] *= factor
-    builder.body_inv_mass[body] /= factor
-    builder.body_inertia[body] = builder.body_inertia[body] * factor
-    builder.body_inv_inertia[body] = builder.body_inv_inertia[body] * (1.0 / factor)
+    multiples = {"mass": factor, "inv_mass": 1.0 / factor, "inertia": factor, "inv_inertia": 1.0 / factor}
+    for name, multiple in multiples.items():
+        values = getattr(builder, f"body_{name}")
+        values[body] = values[body] * multiple

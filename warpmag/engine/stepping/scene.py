@@ -14,6 +14,7 @@ from warpmag.declarations.magnets import Magnet, StageMagnets
 from warpmag.engine.magnets.attributes import declare_attributes, mark_shapes
 from warpmag.engine.magnets.balls import copy_ball
 from warpmag.engine.magnets.declared_magnets import axis_rotation, in_shape_frame, magnet_shapes
+from warpmag.engine.newton_versions import reverse_targets
 from warpmag.engine.magnets.declared_sources import add_placed_source
 from warpmag.engine.stepping.replaced_meshes import StageBuilder
 from warpmag.errors import InputError
@@ -164,8 +165,7 @@ def _correct_grounded_joint(
         axis = builder.joint_qd_start[index]
         lower, upper = builder.joint_limit_lower[axis], builder.joint_limit_upper[axis]
         builder.joint_limit_lower[axis], builder.joint_limit_upper[axis] = -upper, -lower
-        builder.joint_target_qd[axis] *= -1.0
-        builder.joint_target_q[builder.joint_q_start[index]] *= -1.0
+        reverse_targets(builder, index, axis)
     if joint.fixed and not joint.collides:
         for prim, shape in shapes.items():
             if prim == joint.fixed or prim.startswith(f"{joint.fixed}/"):
