@@ -29,7 +29,7 @@ def has_tendons(model: newton.Model) -> bool:
 
 
 def reverse_targets(builder: newton.ModelBuilder, joint: int, axis: int) -> None:
-    """Reverse position and velocity that a joint's drive tends to along its axis, whose degree of freedom is ``axis``."""
+    """Reverse the target position and velocity of a joint's drive along its axis, the degree of freedom ``axis``."""
     if hasattr(builder, "joint_target_q"):
         builder.joint_target_qd[axis] *= -1.0
         builder.joint_target_q[builder.joint_q_start[joint]] *= -1.0

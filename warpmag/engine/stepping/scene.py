@@ -14,8 +14,8 @@ from warpmag.declarations.magnets import Magnet, StageMagnets
 from warpmag.engine.magnets.attributes import declare_attributes, mark_shapes
 from warpmag.engine.magnets.balls import copy_ball
 from warpmag.engine.magnets.declared_magnets import axis_rotation, in_shape_frame, magnet_shapes
-from warpmag.engine.newton_versions import reverse_targets
 from warpmag.engine.magnets.declared_sources import add_placed_source
+from warpmag.engine.newton_versions import reverse_targets
 from warpmag.engine.stepping.replaced_meshes import StageBuilder
 from warpmag.errors import InputError
 from warpmag.usd import (
