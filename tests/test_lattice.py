@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from warpmag.errors import InputError
-from warpmag.shapes import lattice
+from warpmag.shapes import facets, lattice
 
 TILT = (0.3, -0.2, 0.5, 0.7)
 
@@ -172,6 +172,17 @@ def test_concave_mesh():
     np.testing.assert_allclose(centroid(body), [0.0125, 0.0075, 0.005], atol=1e-12)
     notch = (body.positions[:, 0] > 0.01) & (body.positions[:, 1] > 0.01)
     assert not notch.any()
+
+
+def test_facets_leave_out_triangles_without_area():
+    """Polygons with a straight corner have such triangles, which have no normal."""
+    outline = np.array([[0, 0], [1, 0], [3, 0], [3, 2], [0, 2]]) * 0.01
+    vertices, faces = prism(outline, [(0, 1, 2), (0, 2, 3), (0, 3, 4)], 0.01)
+    solid = lattice.mesh(vertices, faces)
+    normals, areas = facets.normals_and_areas(solid.facets(200))
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, rtol=1e-12)
+    assert areas.sum() == pytest.approx(2 * 6e-4 + 10e-2 * 0.01, rel=1e-12)
+    np.testing.assert_allclose(areas @ normals, 0.0, atol=1e-16)
 
 
 def test_torus_mesh_and_its_inside():

@@ -14,6 +14,8 @@ _LEAST_PER_SIDE = 3
 """Smallest number of facets along a side of a box."""
 _TEST_OFFSET = 1e-4
 """Distance of the test points on both sides of a facet from its center, in square roots of its area."""
+_FLAT = 1e-6
+"""Height of a triangle over its longest side up to which it has no area, in single precision."""
 
 
 def box(half_extents: np.ndarray, count: int) -> np.ndarray:
@@ -65,7 +67,13 @@ def capsule(radius: float, half_height: float, count: int) -> np.ndarray:
 
 
 def mesh(corners: np.ndarray, count: int) -> np.ndarray:
-    """Return at least ``count`` facets of a mesh with triangles [n, 3, 3], by halving triangles with long sides."""
+    """Return at least ``count`` facets of a mesh with triangles [n, 3, 3], by halving triangles with long sides.
+
+    Triangles without area, such as those of a polygon with a straight corner, are left out.
+    """
+    sides = np.roll(corners, -1, axis=1) - corners
+    areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    corners = corners[areas > _FLAT * (sides**2).sum(axis=2).max(axis=1)]
     while len(corners) < count:
         sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
         longest, side = sides.max(axis=1), sides.argmax(axis=1)
