@@ -14,6 +14,7 @@ import warp as wp
 
 import warpmag
 from bench.machine import line_writer
+from bench.prisms import prism
 from bench.reference.iron_bodies import SETUPS, Body, Setup, load
 from warpmag.declarations.magnets import CONTACT_MODELS
 
@@ -65,11 +66,7 @@ def model_forces(
     setup: Setup, cells: int, device, contact_model: str
 ) -> tuple[np.ndarray, np.ndarray, warpmag.Magnetics]:
     """Forces [N] and moments [A·m²] of the bodies, shape [n, 3], in a Newton model; and its magnets."""
-    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
-    warpmag.register_custom_attributes(builder)
-    for body in setup.bodies:
-        _add(builder, body, cells)
-    model = builder.finalize(device=device)
+    model = model_of(setup, cells, device)
     settings = {"external_field": setup.field, "rtol": _SETTLED, "contact_model": contact_model}
     magnetics, state = warpmag.Magnetics(model, **settings), model.state()
     state.clear_forces()
@@ -77,6 +74,15 @@ def model_forces(
     moments = np.zeros((len(setup.bodies), 3))
     moments[magnetics.shapes] = magnetics.shape_moments()
     return state.body_f.numpy()[:, :3].astype(float), moments, magnetics
+
+
+def model_of(setup: Setup, cells: int, device) -> newton.Model:
+    """Model of a setup with about ``cells`` moments in each body; 0 means automatic numbers."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    warpmag.register_custom_attributes(builder)
+    for body in setup.bodies:
+        _add(builder, body, cells)
+    return builder.finalize(device=device)
 
 
 def _add(builder: newton.ModelBuilder, body: Body, cells: int) -> None:
@@ -87,6 +93,8 @@ def _add(builder: newton.ModelBuilder, body: Body, cells: int) -> None:
         builder.add_shape_box(link, hx=body.size[0], hy=body.size[1], hz=body.size[2])
     elif body.shape == "cylinder":
         builder.add_shape_cylinder(link, radius=body.size[0], half_height=body.size[1])
+    elif body.shape == "prism":
+        builder.add_shape_mesh(link, mesh=prism(body.outline, body.size[0]))
     else:
         builder.add_shape_sphere(link, radius=body.size[0])
     spacing = math.cbrt(body.volume / cells) if cells else 0.0

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from bench import iron
+from bench.prisms import prism
 from bench.reference.iron_bodies import SETUPS, Body, load
 from bench.reference.oracle import MU0
 from bench.reference.spheres import pair
+from warpmag.shapes import lattice
 
 
 def test_every_setup_has_a_converged_reference():
@@ -44,6 +46,17 @@ def test_volume_of_a_body():
     volumes = {shape: Body(shape, size, (0.0, 0.0, 0.0)).volume for shape, size in sizes.items()}
     expected = {"ball": 4.0 / 3.0 * math.pi * 1.25e-7, "cylinder": math.pi * 1e-4 * 0.006, "box": 0.02 * 0.04 * 0.006}
     assert volumes == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_a_letter_is_its_mesh(index):
+    """Volume [m³] and reach are those of the mesh in single precision."""
+    letter = SETUPS["letters T and L, gap 0.2"].bodies[index]
+    mesh = prism(letter.outline, letter.size[0])
+    solid = lattice.mesh(np.asarray(mesh.vertices, float), np.asarray(mesh.indices).reshape(-1, 3))
+    assert letter.volume == pytest.approx([4.8e-7, 4.48e-7][index], rel=1e-12)
+    assert solid.volume == pytest.approx(letter.volume, rel=1e-6)
+    assert letter.reach == pytest.approx(np.linalg.norm(mesh.vertices, axis=1).max(), rel=1e-6)
 
 
 def test_lines_compare_a_model_with_the_table(device, monkeypatch, capsys):

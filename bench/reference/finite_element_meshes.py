@@ -114,16 +114,31 @@ def _distance(body: Body, points: np.ndarray) -> np.ndarray:
         return np.sqrt(x * x + y * y + z * z) - size[0]
     c, s = math.cos(body.turn), math.sin(body.turn)
     x, z = c * x - s * z, s * x + c * z
-    inward = np.abs([x, y, z]) if body.shape == "box" else np.array([np.hypot(x, y), np.abs(z)])
-    excess = inward - size[:, None]
+    if body.shape == "prism":
+        excess = np.array([_outline_distance(1e3 * np.array(body.outline), x, z), np.abs(y) - size[0]])
+    else:
+        inward = np.abs([x, y, z]) if body.shape == "box" else np.array([np.hypot(x, y), np.abs(z)])
+        excess = inward - size[:, None]
     return np.linalg.norm(np.maximum(excess, 0.0), axis=0) + np.minimum(excess.max(axis=0), 0.0)
+
+
+def _outline_distance(outline: np.ndarray, x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Distances of points (x, z) from a polygon, negative inside, shape [n]."""
+    points, begin, end = np.stack([x, z], axis=-1)[:, None], outline, np.roll(outline, -1, axis=0)
+    edge, offset = end - begin, points - begin
+    along = np.clip((offset * edge).sum(axis=2) / (edge**2).sum(axis=1), 0.0, 1.0)
+    distance = np.linalg.norm(offset - along[..., None] * edge, axis=2).min(axis=1)
+    crosses = (begin[:, 1] > points[..., 1]) != (end[:, 1] > points[..., 1])
+    side = edge[:, 0] * offset[..., 1] - edge[:, 1] * offset[..., 0]
+    inside = (crosses & ((side < 0.0) == (edge[:, 1] > 0.0))).sum(axis=1) % 2 == 1
+    return np.where(inside, -distance, distance)
 
 
 def _extent(setup: Setup) -> tuple[np.ndarray, float]:
     """Center of the bodies and largest distance of their parts from it [mm]."""
     centers = 1e3 * np.array([body.center for body in setup.bodies])
     middle = 0.5 * (centers.min(axis=0) + centers.max(axis=0))
-    reach = [1e3 * math.hypot(*body.size) for body in setup.bodies]
+    reach = [1e3 * body.reach for body in setup.bodies]
     return middle, float((np.linalg.norm(centers - middle, axis=1) + reach).max())
 
 
@@ -155,8 +170,12 @@ def _solid(body: Body):
         for edge in solid.edges:
             edge.hpref = 1 if abs(edge.center[2] - z) > 0.9 * size[1] else 0  # not the seam
         return solid
-    upper = occ.Pnt(*size)
-    solid = occ.Box(occ.Pnt(*(-length for length in size)), upper)
+    if body.shape == "prism":
+        corners = [occ.Pnt(1e3 * x, -size[0], 1e3 * z) for x, z in body.outline]
+        edges = [occ.Segment(a, b) for a, b in zip(corners, corners[1:] + corners[:1], strict=True)]
+        solid = occ.Face(occ.Wire(edges)).Extrude(occ.Vec(0, 2.0 * size[0], 0))
+    else:
+        solid = occ.Box(occ.Pnt(*(-length for length in size)), occ.Pnt(*size))
     for part in (*solid.edges, *solid.vertices):
         part.hpref = 1
     turned = solid.Rotate(occ.Axis(occ.Pnt(0, 0, 0), occ.Y), math.degrees(body.turn))

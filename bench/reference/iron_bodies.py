@@ -22,17 +22,27 @@ _REMANENCE = 1.3  # of N42 [T]
 class Body:
     """A body of iron or a permanent magnet."""
 
-    shape: str  # box, cylinder or ball
-    size: tuple[float, ...]  # half sides of a box, radius and half height of a cylinder along z, radius [m]
+    shape: str  # box, cylinder, ball or prism
+    size: tuple[float, ...]  # half sides of a box, radius and half height of a cylinder along z, radius [m]; of a
+    # prism along y half the length
     center: tuple[float, float, float]  # [m]
     susceptibility: float = _SUSCEPTIBILITY  # of a magnet its recoil permeability less 1
     material: str | None = None  # with a measured curve, in place of the susceptibility
     magnetization: tuple[float, float, float] | None = None  # of a magnet without a field [A/m]
     turn: float = 0.0  # rotation about y [rad]
+    outline: tuple[tuple[float, float], ...] = ()  # corners (x, z) of a prism around the center [m]
+
+    @property
+    def reach(self) -> float:
+        """Largest distance of a point from the center [m]."""
+        return math.hypot(*self.size, max((math.hypot(*corner) for corner in self.outline), default=0.0))
 
     @property
     def volume(self) -> float:
         """Volume [m³]."""
+        if self.shape == "prism":
+            edges = zip(self.outline, self.outline[1:] + self.outline[:1], strict=True)
+            return self.size[0] * abs(sum(a[0] * b[1] - a[1] * b[0] for a, b in edges))
         unit = {"box": 8.0, "cylinder": 2.0 * math.pi, "ball": 4.0 / 3.0 * math.pi}[self.shape]
         powers = {"box": (1, 1, 1), "cylinder": (2, 1), "ball": (3,)}[self.shape]
         return unit * math.prod(length**power for length, power in zip(self.size, powers, strict=True))
@@ -53,14 +63,14 @@ class Setup:
     @property
     def is_axial(self) -> bool:
         """True if the z axis is an axis of rotation of bodies and fields."""
-        round_bodies = all(body.shape != "box" and not any(body.center[:2]) for body in self.bodies)
+        round_bodies = all(body.shape in ("ball", "cylinder") and not any(body.center[:2]) for body in self.bodies)
         return round_bodies and not any(vector[0] or vector[1] for vector in self.vectors)
 
     def is_mirrored(self, axis: int) -> bool:
         """True if the plane through the origin across an axis mirrors bodies, field and magnetizations."""
-        turned = axis == 0 and any(body.turn % (0.5 * math.pi) for body in self.bodies)
+        oblique = axis == 0 and any(body.outline or body.turn % (0.5 * math.pi) for body in self.bodies)
         centered = not any(body.center[axis] for body in self.bodies)
-        return centered and not turned and not any(vector[axis] for vector in self.vectors)
+        return centered and not oblique and not any(vector[axis] for vector in self.vectors)
 
 
 def _millimeters(*lengths: float) -> tuple[float, ...]:
@@ -82,6 +92,13 @@ def _box(sides, bottom: float, x: float = 0.0, **properties) -> Body:
     """Box from its sides and the height of its lower face [mm]."""
     half = _millimeters(*(0.5 * side for side in sides))
     return Body("box", half, _millimeters(x, 0.0, bottom + 0.5 * sides[2]), **properties)
+
+
+def _letter(corners, x: float) -> Body:
+    """Iron letter of 4 mm in y from the corners (x, z) of its outline and the shift of the outline along x [mm]."""
+    middle = 0.5 * max(corner[0] for corner in corners), 0.5 * max(corner[1] for corner in corners)
+    outline = [_millimeters(corner[0] - middle[0], corner[1] - middle[1]) for corner in corners]
+    return Body("prism", _millimeters(2.0), _millimeters(x + middle[0], 0.0, middle[1]), outline=tuple(outline))
 
 
 def _magnet(permeability: float = 1.0, sign: float = 1.0) -> dict:
@@ -132,7 +149,32 @@ def _solid_setups() -> dict[str, Setup]:
     return setups
 
 
-SETUPS = _axial_setups() | _solid_setups()
+def _letter_setups() -> dict[str, Setup]:
+    t = (5, 0), (9, 0), (9, 16), (14, 16), (14, 20), (0, 20), (0, 16), (5, 16)
+    l = (0, 0), (12, 0), (12, 4), (4, 4), (4, 20), (0, 20)  # noqa: E741
+    return {
+        f"letters T and L, gap {gap:g}": Setup((_letter(t, -14.0 - gap), _letter(l, 0.0)), (_FIELD, 0.0, 0.0))
+        for gap in (0.2, 1.0)
+    }
+
+
+def _assembled_setups() -> dict[str, Setup]:
+    """Setups off axes of symmetry, and a circuit of four bodies: magnets stand 0.2 mm above the yoke."""
+    setups = {}
+    for gap in (0.2, 1.0):
+        poles = [_cylinder(10.0, 5.0, 5.2, 15.0 * sign, **_magnet(sign=sign)) for sign in (-1.0, 1.0)]
+        yoke, bar = _box((50.0, 12.0, 5.0), 0.0), _box((50.0, 12.0, 5.0), 10.2 + gap)
+        setups[f"yoke with two magnets and bar, gap {gap:g}"] = Setup((yoke, *poles, bar))
+    turn = math.radians(10.0)
+    height = 10.0 * (math.cos(turn) + math.sin(turn))
+    cubes = _box((20.0, 20.0, 20.0), -20.0), _box((20.0, 20.0, 20.0), 0.5 + height - 10.0, turn=turn)
+    setups["tilted cube over cube, gap 0.5"] = Setup(cubes, (0.0, 0.0, _FIELD))
+    plate, disc = _box((40.0, 40.0, 3.0), 0.0), _cylinder(20.0, 5.0, 4.0, 20.0, **_magnet())
+    setups["magnet over the edge of iron plate 3, gap 1"] = Setup((plate, disc))
+    return setups
+
+
+SETUPS = _axial_setups() | _solid_setups() | _letter_setups() | _assembled_setups()
 """Setups by name."""
 
 

@@ -1,0 +1,36 @@
+"""Random heaps of iron bodies and magnets: solved, balanced, with a positive definite operator of induction."""
+
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from bench import heaps
+
+
+@pytest.mark.parametrize(("count", "seed"), [(20, 7), pytest.param(500, 8, marks=pytest.mark.long)])
+def test_heaps_are_stable_and_balanced(count, seed, device):
+    verdicts = list(heaps.judge(count, seed, 100, device))
+    assert [asdict(verdict) for verdict in verdicts if not verdict.passes] == []
+    assert len(verdicts) == count and sum(verdict.operator is not None for verdict in verdicts) > count // 5
+    assert np.median([[verdict.force_sum, verdict.torque_sum] for verdict in verdicts]) < 3e-7
+
+
+def test_heaps_have_all_shapes_and_materials():
+    """Every shape and kind of material is drawn, and heaps repeat."""
+    drawn = heaps.draw(0, 7)
+    pieces = [piece for heap in drawn for piece in heap.pieces]
+    assert len({piece.geometry.shape for piece in pieces}) == 10
+    for name in ("saturation", "curve", "material", "magnetization"):
+        assert sum(name in piece.material for piece in pieces) > len(drawn) // 6
+    assert heaps.draw(0, 7)[3].field.tolist() == drawn[3].field.tolist() != heaps.draw(1, 7)[3].field.tolist()
+
+
+def test_a_heap_that_fails_is_seen():
+    """Sums and eigenvalues that are NaN fail."""
+    good = heaps.Verdict(0, 10, 20, converged=True, finite=True, force_sum=1e-7, torque_sum=1e-7, operator=0.1)
+    assert good.passes
+    for name, value in {"converged": False, "finite": False, "operator": -0.1}.items():
+        assert not heaps.Verdict(**(asdict(good) | {name: value})).passes
+    for name in ("force_sum", "torque_sum", "operator"):
+        assert not heaps.Verdict(**(asdict(good) | {name: np.nan})).passes
