@@ -31,9 +31,10 @@ _SUSCEPTIBILITIES, _FIELDS = (10.0, 5000.0), (1e3, 1e6)  # fields in A/m
 _UNSATURATED = 1e9  # saturation of iron with a linear curve [A/m]
 _REMANENCE = 1e6  # of magnets [A/m]
 _SETTLED = 1e-4  # tolerance of the solve
-IMBALANCE = 1e-5
-"""Largest sum of forces or torques over the sum of their absolute values. A Gauss point of one body near an edge of
-another amplifies the rounding of single precision."""
+IMBALANCE = 1e-3
+"""Largest sum of forces or torques over the sum of their absolute values. Half of the heaps are below 1e-7, nine of
+ten below 1e-6. Where a Gauss point of one body is at a distance p from an edge of another one, rounding of float32 is a
+share 6e-8 size/p of the force, and p counts from 1e-4 of a size (``box_field.h``). In float64 sums are below 1e-13."""
 _LETTERS = {
     "L": ((-6, -10), (6, -10), (6, -6), (-2, -6), (-2, 10), (-6, 10)),
     "T": ((-2, -10), (2, -10), (2, 6), (7, 6), (7, 10), (-7, 10), (-7, 6), (-2, 6)),
@@ -138,14 +139,14 @@ def _heap(rng, geometries: list[Geometry]) -> Heap:
 def _pose(rng, pieces: list[Piece], half: np.ndarray) -> tuple[np.ndarray, Rotation]:
     """Center [m] and rotation of a body: face on face of an earlier one, or turned and touching or intersecting."""
     if not pieces:
-        return np.zeros(3), Rotation.random(random_state=rng)
+        return np.zeros(3), _turn(rng)
     below = pieces[rng.integers(len(pieces))]
     if rng.random() < 0.4:
         axis, offset = rng.integers(3), rng.uniform(-0.5, 0.5, 3) * half
         offset[axis] = rng.choice((-1.0, 1.0)) * (half + below.geometry.half)[axis] * rng.choice((1.0, 1.02))
         return below.center + below.turn.apply(offset), below.turn
     reach = half.max() + rng.uniform(0.1, 1.0) * below.geometry.half.max()
-    return below.center + _direction(rng) * reach * rng.uniform(0.1, 1.0), Rotation.random(random_state=rng)
+    return below.center + _direction(rng) * reach * rng.uniform(0.1, 1.0), _turn(rng)
 
 
 def _iron(rng) -> dict:
@@ -163,6 +164,10 @@ def _magnet(rng) -> dict:
 
 def _logarithmic(rng, limits: tuple[float, float]) -> float:
     return float(np.exp(rng.uniform(*np.log(limits))))
+
+
+def _turn(rng) -> Rotation:
+    return Rotation.from_quat(rng.normal(size=4))
 
 
 def _direction(rng) -> np.ndarray:
@@ -280,7 +285,7 @@ def _add(builder: newton.ModelBuilder, piece: Piece) -> None:
     else:
         builder.add_shape_box(body, hx=half[0], hy=half[1], hz=half[2])
     add = warpmag.add_permanent if "magnetization" in piece.material else warpmag.add_inducible
-    add(builder, body, moment_spacing=geometry.spacing, **piece.material)
+    add(builder, body=body, moment_spacing=geometry.spacing, **piece.material)
 
 
 def _balance(parts: list[np.ndarray]) -> float:
@@ -294,7 +299,8 @@ def _least(field: np.ndarray, slopes: np.ndarray) -> tuple[float, float]:
     size = 3 * len(slopes)
     demagnetization = np.eye(size) / 3.0 - field.reshape(size, size)
     operator = demagnetization + np.diag(np.repeat(1.0 / slopes - 1.0 / 3.0, 3))
-    return tuple(float(np.linalg.eigvalsh(0.5 * (a + a.T))[0]) for a in (demagnetization, operator))
+    least = [float(np.linalg.eigvalsh(0.5 * (a + a.T))[0]) for a in (demagnetization, operator)]
+    return least[0], least[1]
 
 
 def judge(count: int, seed: int, most_cells: int = 0, device="cpu"):
@@ -323,6 +329,7 @@ def main() -> None:
     for name in ("cells", "evaluations", "force_sum", "torque_sum"):
         column = [getattr(verdict, name) for verdict in verdicts]
         summary |= {f"median {name}": float(np.median(column)), f"largest {name}": max(column)}
+    summary["above 1e-6"] = sum(verdict.force_sum > 1e-6 or verdict.torque_sum > 1e-6 for verdict in verdicts)
     summary["eigenvalues of"] = len(spectra)
     for name in ("demagnetization", "operator") if spectra else ():
         summary[f"least {name}"] = min(getattr(verdict, name) for verdict in spectra)

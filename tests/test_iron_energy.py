@@ -100,9 +100,9 @@ def bars(name, device):
         hx, hy, hz = HALF_SIDES
         builder.add_shape_box(body, hx=hx, hy=hy, hz=hz, cfg=newton.ModelBuilder.ShapeConfig(density=7870.0))
         if material:
-            warpmag.add_permanent(builder, body, **material)
+            warpmag.add_permanent(builder, body=body, **material)
         else:
-            warpmag.add_inducible(builder, body, material="1010-steel", moment_spacing=0.002)
+            warpmag.add_inducible(builder, body=body, material="1010-steel", moment_spacing=0.002)
     model = builder.finalize(device=device)
     return model, warpmag.Magnetics(model, external_field=field, rtol=1e-4)
 

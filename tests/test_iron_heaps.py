@@ -13,7 +13,8 @@ def test_heaps_are_stable_and_balanced(count, seed, device):
     verdicts = list(heaps.judge(count, seed, 100, device))
     assert [asdict(verdict) for verdict in verdicts if not verdict.passes] == []
     assert len(verdicts) == count and sum(verdict.operator is not None for verdict in verdicts) > count // 5
-    assert np.median([[verdict.force_sum, verdict.torque_sum] for verdict in verdicts]) < 3e-7
+    sums = np.array([[verdict.force_sum, verdict.torque_sum] for verdict in verdicts])
+    assert np.median(sums) < 3e-7 and np.quantile(sums, 0.8) < 1e-6
 
 
 def test_heaps_have_all_shapes_and_materials():
