@@ -216,8 +216,13 @@ class SolvedHeaps:
         """Sums of forces and torques over the sums of their absolute values.
 
         Torques are about the origin, without those of the applied field. The solver leaves out those on the moments of
-        single balls, which are 0 in equilibrium.
+        single balls, which are 0 in equilibrium. Forces on bodies inside a ball are 0: they count from a thousandth of
+        the torque of the applied field over the extent of the heap.
         """
+        extent = np.linalg.norm(positions - positions[0], axis=1).max()
+        least_force = (
+            1e-3 * MU0 * np.linalg.norm(moments, axis=1).sum() * np.linalg.norm(self.heaps[world].field) / extent
+        )
         balls = self._single_balls()[cells, None]
         turning = [
             torques,
@@ -225,7 +230,7 @@ class SolvedHeaps:
             -MU0 * np.cross(moments, self.heaps[world].field),
             MU0 * np.cross(moments, h) * balls,
         ]
-        return _balance([forces]), _balance(turning)
+        return _balance([forces], least_force), _balance(turning)
 
     def _single_balls(self) -> np.ndarray:
         """True for moments that are a whole inducible ball each, shape [moments]."""
@@ -288,10 +293,10 @@ def _add(builder: newton.ModelBuilder, piece: Piece) -> None:
     add(builder, body=body, moment_spacing=geometry.spacing, **piece.material)
 
 
-def _balance(parts: list[np.ndarray]) -> float:
-    """Length of the sum of vectors over the sum of their lengths; 0 if all are 0."""
+def _balance(parts: list[np.ndarray], least: float = 1e-300) -> float:
+    """Length of the sum of vectors over the sum of their lengths, or over ``least`` where that is larger."""
     vectors = np.concatenate(parts)
-    return float(np.linalg.norm(vectors.sum(axis=0)) / max(np.linalg.norm(vectors, axis=1).sum(), 1e-300))
+    return float(np.linalg.norm(vectors.sum(axis=0)) / max(np.linalg.norm(vectors, axis=1).sum(), least))
 
 
 def _least(field: np.ndarray, slopes: np.ndarray) -> tuple[float, float]:
