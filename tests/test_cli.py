@@ -267,3 +267,26 @@ def test_a_hidden_gpu_is_no_news(tmp_path):
     assert "no CUDA-capable device is detected" in loud.stderr  # the driver is taken
     done = subprocess.run([sys.executable, "-c", quiet], env=environment, capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@pytest.mark.parametrize("arguments", [["scenes"], ["check", "balls_up"]])
+def test_a_full_standard_output_ends_in_one_line(arguments):
+    command = [sys.executable, "-m", "warpmag.cli", *arguments]
+    with open("/dev/full", "w", encoding="utf-8") as full:
+        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=300, check=False)
+    assert result.returncode == 1
+    assert result.stderr == "warpmag: [Errno 28] No space left on device\n"
+
+
+@pytest.mark.parametrize("where", [{"WARP_CACHE_PATH": "/dev/null/x"}, {"HOME": "/dev/null"}])
+def test_without_a_usable_cache_kernels_are_compiled_for_one_command(where):
+    program = (
+        "from warpmag.terminal import quiet_warp; quiet_warp(); import warp, os;"
+        "print(os.access(warp.config.kernel_cache_dir, os.W_OK))"
+    )
+    environment = {key: value for key, value in os.environ.items() if key not in ("WARP_CACHE_PATH", "XDG_CACHE_HOME")}
+    command = [sys.executable, "-c", program]
+    result = subprocess.run(command, env=environment | where, capture_output=True, text=True, timeout=300, check=False)
+    assert result.stdout == "True\n"
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("warpmag: warning: kernels are compiled for this command only")

@@ -293,6 +293,31 @@ def test_wrong_control(wrong, device):
         simulation.control = control
 
 
+@pytest.mark.parametrize("name", ["energy", "shape_moments", "h_field", "b_field", "field_gradient"])
+def test_no_result_before_the_first_solve(name, device):
+    magnetics = warpmag.Magnetics(other_model(device, 2))
+    with pytest.raises(warpmag.InputError, match="^Magnetics: there is no field yet"):
+        getattr(magnetics, name)(*([(0.0, 0.0, 1.0)] if "field" in name else []))
+
+
+@pytest.mark.parametrize("magnetization", [(0.0, 0.0, 1e30), (1e16, 0.0, 0.0), (0.0, -3e38, 0.0)])
+def test_magnetization_beyond_single_precision(magnetization, device):
+    """Fields and forces were NaN, without a word."""
+    builder = new_builder()
+    with pytest.raises(warpmag.InputError, match="magnetization: components must be at most 1e.15"):
+        add_ball(builder, (0.0, 0.0, 0.0), magnetization)
+    magnetics = warpmag.Magnetics(other_model(device, 2))
+    with pytest.raises(warpmag.InputError, match="magnetization: components must be at most 1e.15"):
+        magnetics.set_magnetization(magnetization, body=1)
+
+
+def test_steps_without_a_run_have_no_duration(device):
+    simulation = simulation_of_two(device)
+    simulation.step()
+    (line,) = (line for line in simulation.finish().summary() if line.startswith("steps"))
+    assert " s" not in line.partition(")")[2]
+
+
 def test_builder_that_grows_after_its_model(device):
     """Newton's models share lists with their builders; forces are those of the model alone."""
     forces = []

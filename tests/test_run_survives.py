@@ -23,6 +23,7 @@ from run_server import RunServer
 from warpmag import InputError, Simulation, cli
 from warpmag.engine.stepping import recording
 from warpmag.scenes_usd import balls_up
+from warpmag.usd.read.trial_read import trial_read
 
 FRAMES = 60
 BALLS = 18
@@ -413,3 +414,23 @@ def test_fifty_random_moments(scene, tmp_path, way):
             for left in survival.output.parent.iterdir():
                 left.unlink()
     survival.server.close()
+
+
+@pytest.mark.parametrize("place", [0.02, 0.3, 0.6, 0.9, 0.97])
+def test_a_damaged_cache_is_refused_or_readable(place, scene, tmp_path, device, always, capsys):
+    """Zeros in the cache: USD opens the result of a resumed run, or the run is refused in one line."""
+    output = tmp_path / "out.usda"
+    Simulation(scene, device=device).run(4, output=output, on_frame=lambda frame: frame < 2)
+    cache = tmp_path / "out.cache.usdc"
+    content = bytearray(cache.read_bytes())
+    begin = int(place * len(content))
+    content[begin : begin + 512] = bytes(len(content[begin : begin + 512]))
+    cache.write_bytes(content)
+    code = cli.main(["run", str(scene), "--frames", "4", "-o", str(output), "--device", device, "--resume"])
+    if code:
+        assert code == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("warpmag: ") and "resume" in line
+    else:
+        assert len(frames_of(output)) == 5
+        assert not trial_read(cache)

@@ -1,7 +1,12 @@
 """What ``SECURITY.md`` says of a stage from a stranger."""
 
 import http.server
+import os
+import signal
+import subprocess
+import sys
 import threading
+import time
 
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
@@ -91,3 +96,203 @@ def test_a_texture_in_a_file_is_read(tmp_path):
     PICTURES.new("RGB", (2, 2), (255, 0, 0)).save(tmp_path / "picture.png")
     textured(tmp_path / "scene.usda", "./picture.png")
     assert shapes_with_texture(tmp_path / "scene.usda")
+
+
+CHAINS = {
+    "the input": [],
+    "an input of the material": ["/World/Thing/Material.inputs:chosen"],
+    "an output": ["/World/Thing/Material/Values.outputs:chosen"],
+    "a chain": ["/World/Thing/Material.inputs:chosen", "/World/Thing/Material/Values.outputs:chosen"],
+    "an output of a prim without a type": ["/World/Thing/Material/Plain.outputs:chosen"],
+}
+KINDS = ("Asset", "String", "Token")
+
+
+def chained(path, texture, kind, chain, sampled):
+    """A stage whose texture is behind connections, perhaps in a time sample."""
+    kind = getattr(Sdf.ValueTypeNames, kind)
+    stage = textured(path, "", kind)
+    UsdShade.NodeGraph.Define(stage, "/World/Thing/Material/Values")
+    stage.DefinePrim("/World/Thing/Material/Plain")
+    attribute = stage.GetAttributeAtPath("/World/Thing/Material/Picture.inputs:file")
+    attribute.Clear()
+    for target in chain:
+        attribute.AddConnection(target)
+        prim, _, name = target.partition(".")
+        attribute = stage.GetPrimAtPath(prim).CreateAttribute(name, kind)
+    attribute.Set(texture, 0.0) if sampled else attribute.Set(texture)
+    stage.GetRootLayer().Save()
+
+
+@pytest.fixture
+def opened(monkeypatch):
+    """Names of the pictures that are opened; none is read."""
+    names = []
+
+    def record(file, *_, **__):
+        names.append(str(file))
+        raise OSError("not read")
+
+    monkeypatch.setattr(PICTURES, "open", record)
+    return names
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+@pytest.mark.parametrize("chain", CHAINS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_texture_is_fetched_or_read_from_a_device(kind, chain, sampled, server, opened, tmp_path):
+    """Neither an address of a network, nor a pipe, under any name."""
+    address, asked = server
+    os.mkfifo(tmp_path / "pipe.png")
+    (tmp_path / "link.png").symlink_to("pipe.png")
+    pipe = str(tmp_path / "pipe.png")
+    names = (address, address.upper().replace("HTTP", "Http"), "/dev/stdin", "/dev/zero", pipe, "./pipe.png")
+    names += ("./link.png", f"file:{pipe}", f"file://{pipe}", f"FILE:{pipe}", "file:%2Fdev%2Fstdin", "/proc/kmsg")
+    for name in names:
+        chained(tmp_path / "scene.usda", name, kind, CHAINS[chain], sampled)
+        try:
+            shapes_with_texture(tmp_path / "scene.usda")
+        except InputError as error:
+            assert "is not a regular file" in str(error)
+        assert (asked, opened) == ([], []), name
+
+
+@pytest.mark.parametrize("chain", CHAINS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_texture_in_a_file_is_read_behind_connections(kind, chain, opened, tmp_path):
+    """The allow list keeps what it should: the same chains with a regular file."""
+    PICTURES.new("RGB", (2, 2), (255, 0, 0)).save(tmp_path / "picture.png")
+    chained(tmp_path / "scene.usda", str(tmp_path / "picture.png"), kind, CHAINS[chain], sampled=False)
+    import_scene(tmp_path / "scene.usda", visuals=True)
+    assert set(opened) == {str(tmp_path / "picture.png")}
+
+
+LAYERS = {
+    "sublayer": ("subLayers = [@./odd.usda@]", ""),
+    "reference": ("", "references = @./odd.usda@"),
+    "payload": ("", "payload = @./odd.usda@"),
+    "reference of a variant": ("", 'variants = {string v = "a"}\n prepend variantSets = "v"'),
+    "clip": ("", 'clips = {dictionary a = {asset[] assetPaths = [@./odd.usda@]\n string primPath = "/A"}}'),
+    "manifest": ("", 'clips = {dictionary a = {asset manifestAssetPath = @./odd.usda@\n string primPath = "/A"}}'),
+    "template of clips": (
+        "",
+        'clips = {dictionary a = {string templateAssetPath = "./odd.#.usda"\n double templateStartTime = 1\n'
+        'double templateEndTime = 2\n double templateStride = 1\n string primPath = "/A"\n}}',
+    ),
+    "layer of a layer": ("subLayers = [@./between.usda@]", ""),
+}
+IRREGULAR = {"pipe": None, "link to a pipe": "pipe", "link to a device": "/dev/stdin", "link to zeros": "/dev/zero"}
+
+
+def odd_stage(folder, place, kind):
+    """A stage that names a layer that is no regular file."""
+    of_layer, of_prim = LAYERS[place]
+    variants = 'variantSet "v" = {"a" {\n}\n"b" (references = @./odd.usda@) {\n}\n}' if "variant" in place else ""
+    header = f"#usda 1.0\n({of_layer}\n)\n"
+    (folder / "scene.usda").write_text(f'{header}def Xform "A" ({of_prim}) {{\ndouble x\n{variants}\n}}\n')
+    (folder / "between.usda").write_text("#usda 1.0\n(subLayers = [@./odd.usda@])\n")
+    os.mkfifo(folder / "pipe")
+    for name in ("odd.usda", "odd.1.usda"):
+        if IRREGULAR[kind] is None:
+            os.mkfifo(folder / name)
+        else:
+            (folder / name).symlink_to(IRREGULAR[kind])
+    return folder / "scene.usda"
+
+
+@pytest.mark.parametrize("kind", IRREGULAR)
+@pytest.mark.parametrize("place", LAYERS)
+def test_no_layer_is_read_from_a_device(place, kind, tmp_path):
+    """Refused in one line, in seconds, with a standard input that never ends."""
+    path = odd_stage(tmp_path, place, kind)
+    reader, writer = os.pipe()
+    command = [sys.executable, "-m", "warpmag.cli", "check", str(path)]
+    began = time.monotonic()
+    try:
+        result = subprocess.run(command, stdin=reader, capture_output=True, text=True, timeout=60, check=False)
+    finally:
+        os.close(reader)
+        os.close(writer)
+    assert result.returncode == 2 and "is not a regular file" in result.stderr, result.stderr
+    assert result.stderr.count("\n") == 1 and time.monotonic() - began < 30.0
+
+
+@pytest.mark.parametrize("kind", IRREGULAR)
+def test_the_stage_itself_is_a_file(kind, tmp_path):
+    odd_stage(tmp_path, "sublayer", kind)
+    for function in (check, import_scene):
+        with pytest.raises(InputError, match="no such file|is not a regular file"):
+            function(tmp_path / "odd.usda")
+
+
+def listed(names, more=""):
+    """A stage of one rigid body with long lists."""
+    header = '#usda 1.0\n(\nmetersPerUnit = 1\nupAxis = "Z"\n)\n'
+    return f'{header}def Xform "A" (\nprepend apiSchemas = [{names}]\n{more}\n)\n{{\n'
+
+
+def clips(start, end, stride):
+    return (
+        'clips = {dictionary a = {string templateAssetPath = "./odd.#.usda"\n '
+        f"double templateStartTime = {start}\n double templateEndTime = {end}\n double templateStride = {stride}\n"
+        'string primPath = "/A"\n}}'
+    )
+
+
+def operations(names):
+    values = "".join(f"double3 {name} = (0, 0, 0)\n" for name in sorted(set(names)))
+    return listed('"PhysicsRigidBodyAPI"') + values + f"uniform token[] xformOpOrder = {names}\n}}\n".replace("'", '"')
+
+
+ENDLESS = {
+    "clips": (
+        listed('"PhysicsRigidBodyAPI"', clips(0, "1e12", 1)) + "}\n",
+        "/A has a template of more than 100000 clips",
+    ),
+    "clips by a small stride": (
+        listed('"PhysicsRigidBodyAPI"', clips(0, 10, "1e-9")) + "}\n",
+        "/A has a template of more than",
+    ),
+    "clips without an end": (
+        listed('"PhysicsRigidBodyAPI"', clips(0, "inf", 1)) + "}\n",
+        "/A has a template of more than",
+    ),
+    "schemas": (
+        listed(", ".join(f'"CollectionAPI:c{n}"' for n in range(20_000))) + "}\n",
+        "/A has 20000 applied API schemas, at most 1000",
+    ),
+    "operations": (operations([f"xformOp:translate:a{n}" for n in range(100_000)]), "/A: has 100000 transform operat"),
+    "one operation again": (operations(["xformOp:translate"] * 100_000), "/A: has 100000 transform operations"),
+    "schemas without a meaning": (listed(", ".join(f'"Odd{n}API"' for n in range(900))) + "}\n", "no magnets"),
+}
+
+
+@pytest.mark.parametrize("case", ENDLESS)
+def test_long_lists_end(case, tmp_path):
+    """A few seconds, with one line; USD and Newton would take minutes, or for ever."""
+    text, message = ENDLESS[case]
+    (tmp_path / "scene.usda").write_text(text)
+    command = [sys.executable, "-m", "warpmag.cli", "check", str(tmp_path / "scene.usda")]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 2 and message in result.stderr + result.stdout
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGHUP"])
+def test_a_signal_ends_native_code(name, tmp_path):
+    """A sum stands for native code that never returns to Python: it holds the lock, and reads no signals."""
+    (tmp_path / "scene.usda").write_text("#usda 1.0\n")
+    number = getattr(signal, name)
+    program = (
+        f"import signal, sys, warpmag.usd; name = signal.Signals({int(number)});"
+        "signal.signal(name, signal.default_int_handler if name == signal.SIGINT else signal.SIG_DFL);"
+        "warpmag.usd.check = lambda path: (print('begun', flush=True), sum(range(10**13)));"
+        "from warpmag.cli import main; sys.exit(main(['check', sys.argv[1]]))"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path / "scene.usda")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "begun\n"
+        began = time.monotonic()
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGKILL and errors == "warpmag: ended by a signal\n"
+    assert time.monotonic() - began < 20.0  # one second, on a loaded machine

@@ -82,7 +82,9 @@ def test_a_read_that_waits_forever_is_ended(tmp_path, monkeypatch):
     pipe = tmp_path / "below.usdc"
     os.mkfifo(pipe)
     path = tmp_path / "stage.usda"
-    path.write_text(HEAD + "(subLayers = [@./below.usdc@])\n")
+    # a variable of another layer: the name is known only after composition
+    path.write_text(HEAD + '(expressionVariables = {string X = "below"}\nsubLayers = [@./between.usda@])\n')
+    (tmp_path / "between.usda").write_text(HEAD + '(subLayers = [@`"./${X}.usdc"`@])\n')
     monkeypatch.setattr(trial_read, "_SECONDS", 1.0)
     began = time.monotonic()
     with pytest.raises(InputError, match="stage.usda: USD did not read it within 1 s"):

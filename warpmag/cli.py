@@ -14,7 +14,16 @@ from warpmag.engine.pile_xpbd.solvers import SOLVERS
 from warpmag.errors import InputError, SimulationError, one_line
 from warpmag.moments.ranks import Ranks, current_ranks, is_first_rank, on_first_rank, without_ranks
 from warpmag.progress import Progress
-from warpmag.terminal import Stopped, collection_paused, log, open_standard_files, quiet_warp, signals_raised, silence
+from warpmag.terminal import (
+    Stopped,
+    collection_paused,
+    log,
+    open_standard_files,
+    quiet_warp,
+    signals_guarded,
+    signals_raised,
+    silence,
+)
 
 BAD_INPUT, FAILED, STOPPED = 2, 1, 128
 """Exit codes. 0 is success. A command ended by a signal exits with ``STOPPED`` plus the signal's number."""
@@ -87,6 +96,9 @@ def _execute(arguments: list[str] | None, all_ranks: Ranks | None) -> tuple[int,
     except BrokenPipeError:
         silence(1)
         return STOPPED + signal.SIGPIPE, "the standard output was closed"
+    except OSError as error:  # a full disk or a lost folder; Python repeats an error of a standard file at exit
+        silence(1)
+        return FAILED, one_line(str(error))
     except Exception as error:
         if all_ranks is None:
             raise
@@ -205,6 +217,7 @@ def _find_scene(name: str, balls: int | None = None, folder: Path = _OUTPUT_FOLD
     return path, False
 
 
+@signals_guarded()
 def _check(options) -> int:
     from warpmag.usd import check  # noqa: PLC0415
 

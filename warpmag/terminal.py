@@ -1,13 +1,31 @@
 """Standard files, signals and garbage collection of the process."""
 
+import atexit
 import contextlib
 import gc
 import os
+import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import threading
 from collections.abc import Iterator
+from typing import Any
+
+_PATIENCE = 1.0
+"""Time after a signal in which Python has to react, before the command is ended [s]."""
+_GUARD = """
+import os, select, signal, sys
+signals, parent, patience = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
+for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    signal.signal(number, signal.SIG_IGN)
+while os.read(signals, 1):
+    if not select.select([signals], [], [], patience)[0]:
+        os.write(2, b"warpmag: ended by a signal\\n")
+        os.kill(parent, signal.SIGKILL)
+"""
+"""Program of a process that ends the command when native code keeps Python from reacting to a signal."""
 
 
 class Stopped(KeyboardInterrupt):
@@ -31,10 +49,49 @@ def open_standard_files() -> None:
 
 
 @contextlib.contextmanager
+def signals_guarded() -> Iterator[None]:
+    """End the process soon after a signal even where native code does not return to Python.
+
+    The C handlers of Python write each signal to a pipe. A child process reads the pipe, and expects a second byte from
+    the Python handler within :data:`_PATIENCE`.
+    """
+    if threading.current_thread() is not threading.main_thread() or not sys.executable or os.name != "posix":
+        yield
+        return
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    command = [sys.executable, "-S", "-E", "-c", _GUARD, str(reader), str(os.getpid()), str(_PATIENCE)]
+    try:
+        guard = subprocess.Popen(command, pass_fds=[reader], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    except OSError:  # no process can be started
+        guard = None
+    os.close(reader)
+    earlier = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(earlier)
+        os.close(writer)
+        if guard:
+            guard.wait()
+
+
+def react() -> None:
+    """Tell the guard that Python has reacted to a signal."""
+    if threading.current_thread() is threading.main_thread():
+        writer = signal.set_wakeup_fd(-1)
+        if writer >= 0:
+            with contextlib.suppress(OSError):
+                os.write(writer, b"\0")
+            signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+
+
+@contextlib.contextmanager
 def signals_raised() -> Iterator[None]:
     """Raise :class:`Stopped` for signals that would end the process. Ignored signals stay ignored."""
 
     def stop(number, _):
+        react()
         raise Stopped(number)
 
     defaults = {
@@ -76,7 +133,26 @@ def quiet_warp() -> None:
     warp.config.log_level = warp.LOG_ERROR
     warp.config.enable_backward = False  # gradients are not used, and double the compile time
     with _without_lines("Could not find or load the NVIDIA CUDA driver", "no CUDA-capable device is detected"):
-        warp.init()
+        try:
+            warp.init()
+            folder = warp.config.kernel_cache_dir
+            usable = os.access(folder, os.W_OK) or bool(
+                os.listdir(folder)
+            )  # a folder of compiled kernels may be enough
+            reason = "" if usable else f"{folder} cannot be written"
+        except OSError as error:
+            reason = f"{error.filename}: {error.strerror}"
+        if reason:
+            _use_temporary_cache(warp, reason)
+
+
+def _use_temporary_cache(warp: Any, reason: str) -> None:
+    """Initialize Warp with a cache that is removed at exit, because of ``reason``."""
+    folder = tempfile.mkdtemp(prefix="warpmag_kernels_")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    log(f"warning: kernels are compiled for this command only, since Warp's cache is of no use ({reason})")
+    warp.config.kernel_cache_dir = folder
+    warp.init()
 
 
 @contextlib.contextmanager

@@ -57,6 +57,13 @@ def check_material(name: str, value: Any, *, infinite: bool = False) -> None:
         raise InputError(f"{name}: must be {least:g} to {most:g}, got {float(value):g}")
 
 
+def check_magnetization(name: str, value: Any) -> None:
+    """Raise :class:`InputError` unless ``value`` is a magnetization with fields that single precision resolves."""
+    check_vector(name, value)
+    if not max(abs(float(component)) for component in value) <= (most := MATERIAL_RANGE["float32"][1]):
+        raise InputError(f"{name}: components must be at most {most:g}, got {tuple(map(float, value))}")
+
+
 def check_recoil(name: str, value: Any) -> None:
     """Raise :class:`InputError` unless ``value`` is a recoil permeability: 1, or from 1.001 to 10."""
     number = real_number(name, value)
@@ -115,7 +122,7 @@ class Magnet:
         "magnetization", "vector3f", "Magnetization",
         "Magnetization of a permanent magnet in the frame of the prim. With a recoil permeability above 1 it is "
         "the remanent magnetization, at zero internal field.",
-        unit="ampere / meter", check=check_vector, kind="permanent", model_change="substep",
+        unit="ampere / meter", check=check_magnetization, kind="permanent", model_change="substep",
     )] = (0.0, 0.0, 0.0)  # fmt: skip
     recoil_permeability: Annotated[float, Attribute(
         "recoilPermeability", "float", "Recoil Permeability",

@@ -158,7 +158,7 @@ class Display:
 
     def _show_arrows(self, state: newton.State) -> None:
         volumes = self._magnetics.shape_volumes[:, None]
-        magnetizations = self._magnetics.shape_moments() / np.where(volumes > 0.0, volumes, np.inf)
+        magnetizations = self._magnetics.sum_moments().numpy() / np.where(volumes > 0.0, volumes, np.inf)
         strengths = np.linalg.norm(magnetizations, axis=1)
         largest = max(float(strengths.max(initial=0.0)), 1e-30)
         centers = _in_world(state, self._bodies, self._frames) + self._offsets(self._worlds)

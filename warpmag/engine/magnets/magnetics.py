@@ -10,7 +10,7 @@ import warp as wp
 from warpmag.declarations import materials
 from warpmag.declarations.checks import check_positive, check_vector, check_whole, short_repr
 from warpmag.declarations.curves import MagnetizationCurve
-from warpmag.declarations.magnets import MagneticSettings
+from warpmag.declarations.magnets import MagneticSettings, check_magnetization
 from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.caller_checks import check_state, held_by_model
 from warpmag.engine.magnets.eddy import gather_velocities, set_conductivities
@@ -353,6 +353,10 @@ class Magnetics:
             InputError: The body or shape has no permanent magnet, or the magnetization has another shape or is not
                 finite.
         """
+        if not isinstance(magnetization, wp.array):
+            magnetization = host_array("magnetization", magnetization)
+            if magnetization.shape == (3,):
+                check_magnetization("magnetization", magnetization)
         selected = self._permanent_bodies == body if shape is None else self._permanent_shapes == shape
         rows = np.flatnonzero(selected)
         if not len(rows) or (shape is None and body < 0):
@@ -430,18 +434,23 @@ class Magnetics:
 
     def _measured_probe(self, points, worlds, *, gradients: bool = False) -> FieldProbe:
         """Return a probe of the points with the present field."""
-        if not self._induced:
-            raise InputError("Magnetics: there is no field yet, call apply(state) or induce(state) first")
+        self._check_solved()
         probe = self.probe(points, worlds=worlds, gradients=gradients)
         self.check_model()
         probe.measure()
         return probe
+
+    def _check_solved(self) -> None:
+        """Raise :class:`InputError` before the first solve."""
+        if not self._induced:
+            raise InputError("Magnetics: there is no field yet, call apply(state) or induce(state) first")
 
     def energy(self) -> np.ndarray:
         """Return the present energy of the magnets of each world [J], shape [worlds]; 0 for a world without magnets.
 
         Its negative gradient with respect to positions is the Kelvin force, see :meth:`MomentSystem.energy`.
         """
+        self._check_solved()
         self.check_model()
         energies = np.zeros(max(self._model.world_count, 1))
         energies[np.maximum(self._worlds, 0)] = self.system.energy()
@@ -452,6 +461,7 @@ class Magnetics:
 
         Where shapes of one body overlap, the common volume belongs to the first of them. Waits for the device.
         """
+        self._check_solved()
         self.check_model()
         return self.sum_moments().numpy()
 

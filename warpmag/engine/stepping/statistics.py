@@ -133,11 +133,12 @@ class Statistics:
             return ["no steps"]
         induction, force, rigid = self.milliseconds
         evaluations = np.array(self.evaluations)
+        duration = f" in {self.wall_seconds:.1f} s" if self.wall_seconds else ""  # steps outside of a run are not timed
         by_multipoles = f", of fields by multipoles {self.field_error:.1e} at the end" if self.field_error else ""
         lines = [
             f"magnets        {self.magnets} moving",
             f"steps          {self.steps} ({self.substeps / self.steps:.2f} substeps each, {self.repeated} repeated, "
-            f"{self.regrown} buffer growths) in {self.wall_seconds:.1f} s",
+            f"{self.regrown} buffer growths){duration}",
             f"time per step  Ti {induction:.2f} ms, Tf {force:.2f} ms, Tr {rigid:.2f} ms",
             f"field          {evaluations.mean():.1f} evaluations per step (median {np.median(evaluations):.0f}, "
             f"max {evaluations.max()}), magnetization error at most {self.error:.1e}{by_multipoles}",

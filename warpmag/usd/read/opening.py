@@ -8,6 +8,8 @@ unchanged.
 
 import os
 import re
+from collections.abc import Sized
+from functools import cache
 from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdGeom
@@ -22,13 +24,15 @@ from warpmag.usd.read.input_errors import NOT_USD, one_line_of, usd_errors
 from warpmag.usd.read.instancers import complete_instances, expand_instancers
 from warpmag.usd.read.keys import make_kinematic
 from warpmag.usd.read.prims import descendants
-from warpmag.usd.read.trial_read import trial_read
+from warpmag.usd.read.trial_read import MOST_NAMES, irregular_dependency, irregular_file, trial_read
 from warpmag.usd.read.units import convert_units
 from warpmag.usd.values import check_type, declared, quiet
 
 _ORDER = "xformOpOrder"
-_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
-"""Beginning of a network address; a Windows drive has one letter."""
+_ADDRESS = re.compile(r"[\x00-\x20]*([A-Za-z][A-Za-z0-9+.-]+:/|file:)", re.IGNORECASE)
+"""Beginning of an address, of a network or of a file; a Windows drive has one letter."""
+_SHADING = ("inputs", "outputs")
+"""Namespaces of the attributes that shaders connect; a connection leads to a value in either."""
 _COMPOSED = ("subLayers", "subLayerOffsets", "layerRelocates")
 """Metadata of a layer that layers above it inherit."""
 
@@ -72,7 +76,11 @@ def open_animated(path: str | os.PathLike) -> tuple[Usd.Stage, list[BallInstance
 
     There is no trial read in a child process: for a long run it would take longer than the export.
     """
-    stage = _open(_readable(path), path)
+    file = _readable(path)
+    with usd_errors(str(path), NOT_USD):
+        if reason := irregular_dependency(full_path(file)):
+            raise InputError(f"{path}: {reason}")
+    stage = _open(file, path)
     with usd_errors(str(path)):
         deferred = expand_instancers(stage, start_of(stage), defer=True)
         complete_instances([balls for balls in deferred if not balls.stays_instancer])
@@ -111,13 +119,14 @@ def freeze(stage: Usd.Stage, time_code: float) -> None:
 
     Newton reads default values only: it would read a pose that has only time samples as the identity. Values inside
     instances cannot be frozen; :func:`warpmag.usd.survey` reports relevant ones. USD ignores time samples of the
-    order of transform operations, so that order stays. Network addresses are blocked. Animated colliders without a
-    rigid body become kinematic bodies.
+    order of transform operations, so that order stays. Textures that are not files are blocked. Animated colliders
+    without a rigid body become kinematic bodies.
     """
     session = stage.GetSessionLayer()
     candidates = [
         attribute
         for prim in stage.Traverse()
+        if _is_bounded(prim)
         for attribute in prim.GetAuthoredAttributes()
         if attribute.GetNumTimeSamples() or attribute.HasSpline() or session.GetAttributeAtPath(attribute.GetPath())
     ]
@@ -129,9 +138,17 @@ def freeze(stage: Usd.Stage, time_code: float) -> None:
                 attribute.Set(value)
             else:  # a blocked sample: as if nothing were authored
                 attribute.Block()
-    _block_addresses(stage)
+    _block_textures(stage)
     transforms = [attribute for attribute in sampled if attribute.GetName().startswith("xformOp:")]
     make_kinematic(stage, {attribute.GetPrim().GetPath() for attribute in transforms}, is_source)
+
+
+def _is_bounded(prim: Usd.Prim) -> bool:
+    """Return True; raise :class:`InputError` for more transform operations than Newton composes in linear time."""
+    order = prim.GetAttribute(_ORDER).Get() if prim.HasAttribute(_ORDER) else None
+    if isinstance(order, Sized) and len(order) > MOST_NAMES:
+        raise InputError(f"{prim.GetPath()}: has {len(order)} transform operations, at most {MOST_NAMES}")
+    return True
 
 
 def _unfreeze(attribute: Usd.Attribute, session: Sdf.Layer) -> bool:
@@ -158,24 +175,44 @@ def _value_at(attribute, time_code):
     return value
 
 
-def _block_addresses(stage: Usd.Stage) -> None:
-    """Block, in the session layer, shader inputs with network addresses: Newton would fetch textures from them."""
-    addresses = []
-    for prim in descendants(stage.GetPseudoRoot()):
-        for attribute in prim.GetAuthoredPropertiesInNamespace("inputs"):
-            value = attribute.Get() if isinstance(attribute, Usd.Attribute) else None
-            text = value.path if isinstance(value, Sdf.AssetPath) else value
-            if isinstance(text, str) and _ADDRESS.match(text):
-                addresses.append((attribute, text))
+def _block_textures(stage: Usd.Stage) -> None:
+    """Block, in the session layer, the values of shaders that Newton could open as anything but a regular file.
+
+    Newton follows connections to values of any type, and would fetch textures from network addresses.
+    """
+    irregular = cache(irregular_file)
+    blocked = [
+        (attribute, text)
+        for prim in descendants(stage.GetPseudoRoot())
+        for namespace in _SHADING
+        for attribute in prim.GetAuthoredPropertiesInNamespace(namespace)
+        if isinstance(attribute, Usd.Attribute)
+        for text in _texts(attribute.Get())
+        if _ADDRESS.match(text) or any(map(irregular, _files(attribute, text)))
+    ]
     with Usd.EditContext(stage, stage.GetSessionLayer()):
-        for attribute, address in addresses:
+        for attribute, text in blocked:
             prim = attribute.GetPrim()
             if prim.IsInstanceProxy():
                 raise InputError(
-                    f"{prim.GetPath()}: {attribute.GetName()} is {address[:80]!r} inside an instance, and nothing is "
-                    "fetched from a network: name a file, or set instanceable = false"
+                    f"{prim.GetPath()}: {attribute.GetName()} is {text[:80]!r} inside an instance, and nothing is "
+                    "fetched from a network or a device: name a file, or set instanceable = false"
                 )
             attribute.Block()
+
+
+def _texts(value) -> list[str]:
+    """Return the texts of a value, and of an array of assets or texts."""
+    if isinstance(value, Sdf.AssetPathArray | list) or type(value).__name__ in ("StringArray", "TokenArray"):
+        return [text for entry in value for text in _texts(entry)]
+    texts = [value.path, value.resolvedPath] if isinstance(value, Sdf.AssetPath) else [value]
+    return [text for text in texts if isinstance(text, str) and text]
+
+
+def _files(attribute: Usd.Attribute, text: str) -> set[str]:
+    """Return the paths that a text of an attribute may stand for, relative to its layers or to the working folder."""
+    layers = {spec.layer for spec in attribute.GetPropertyStack()} | {attribute.GetStage().GetRootLayer()}
+    return {text, *(Sdf.ComputeAssetPathRelativeToLayer(layer, text) for layer in layers if not layer.anonymous)}
 
 
 def first_camera(stage: Usd.Stage) -> Usd.Prim | None:

@@ -1,25 +1,33 @@
 """Opens a stage in a child process first, because USD's reader can crash or hang on damaged or hostile files.
 
+It also decides which files a stage may name: regular files only. A pipe or a device would make the reader wait forever.
+
 The child costs a quarter of a second, so a single text file without references is read directly. This file is also the
 program of the child, which imports nothing of warpmag. Errors that USD raises are raised again when this process
 reads the stage.
 """
 
 import contextlib
+import glob
 import json
 import os
 import re
 import signal
+import stat
 import subprocess
 import sys
 from itertools import accumulate, islice
 
 MOST_PRIMS, DEEPEST_NESTING = 500_000, 5_000
 """Largest numbers of prims in a stage and of bracket levels in a text: USD reads 10,000 levels, crashes at 100,000."""
+MOST_NAMES, MOST_CLIPS = 1_000, 100_000
+"""Largest numbers of applied API schemas and of transform operations of a prim, and of value clips of a template."""
 _SECONDS, _BYTES_PER_SECOND = 30.0, 5e6
 """Least limit of the child's CPU time [s], and bytes of the stage and its files that add a second to it."""
-_ARCS = re.compile(rb"@|references|payload|inherits|specializes|prototypes")
+_ARCS = re.compile(rb"@|references|payload|inherits|specializes|prototypes|clips")
 """Words of a text layer that compose other files, or repeat prims."""
+_SYSTEM_FOLDERS = ("/proc/", "/sys/")
+"""Folders whose files the system makes up: some of them make a reader wait."""
 _NO_BRACKETS = bytes(set(range(256)) - set(b"{[(}])"))
 _NO_TABLE, _NO_TEXT = "its table of contents names bytes beyond its end", "text that is not UTF-8"
 _WARNINGS = {b"posix_madvise": f"damaged: {_NO_TABLE}", b"UnicodeDecodeError": f"damaged: {_NO_TEXT}"}
@@ -28,12 +36,14 @@ _WARNINGS = {b"posix_madvise": f"damaged: {_NO_TABLE}", b"UnicodeDecodeError": f
 
 def trial_read(path: str | os.PathLike) -> str:
     """Return the reason not to read a file in this process, empty if it can be read."""
+    if reason := irregular_file(path):
+        return reason
     with open(path, "rb") as file:
         text = file.read() if file.peek(5).startswith(b"#usda") else b""
     nesting = accumulate(1 if bracket in b"{[(" else -1 for bracket in text.translate(None, _NO_BRACKETS))
     if max(nesting, default=0) > DEEPEST_NESTING:
         return f"brackets are nested more than {DEEPEST_NESTING} deep"
-    if text and not _ARCS.search(text):
+    if text and not _ARCS.search(text) and text.count(b"API:") <= MOST_NAMES:
         return ""
     names = {os.path.join(os.path.dirname(path), os.fsdecode(name)) for name in re.findall(rb"@([^@\n\0]+)@", text)}
     size = os.path.getsize(path) + sum(os.path.getsize(name) for name in names if os.path.isfile(name))
@@ -42,7 +52,8 @@ def trial_read(path: str | os.PathLike) -> str:
     with contextlib.suppress(OSError):  # no interpreter, in an application that embeds Python
         command = [sys.executable or "", "-S", "-E", __file__, *arguments]
         with contextlib.suppress(subprocess.TimeoutExpired):  # twice the time, for a loaded machine
-            child = subprocess.run(command, capture_output=True, check=False, timeout=2 * limit)
+            options = {"stdin": subprocess.DEVNULL, "capture_output": True, "timeout": 2 * limit}
+            child = subprocess.run(command, check=False, **options)
             if child.returncode >= 0:
                 meanings = (meaning for words, meaning in _WARNINGS.items() if words in child.stderr)
                 return child.stdout.decode().strip() or next(meanings, "")
@@ -52,10 +63,67 @@ def trial_read(path: str | os.PathLike) -> str:
     return ""
 
 
+def irregular_file(path: str | os.PathLike) -> str:
+    """Return the reason not to open a path: it is a device, a pipe or a file of the system. Empty otherwise."""
+    real = os.path.realpath(path)
+    try:
+        mode = os.stat(real).st_mode
+    except OSError:  # USD reports missing files
+        return ""
+    regular = (stat.S_ISREG(mode) or stat.S_ISDIR(mode)) and not real.startswith(_SYSTEM_FOLDERS)
+    return "" if regular else f"{path} is not a regular file"
+
+
+def _excess(layer) -> str:
+    """Return the reason not to compose a layer: USD would crash or take very long for a prim. Empty otherwise."""
+    paths: list = []
+    layer.Traverse("/", paths.append)
+    binary = layer.GetFileFormat().formatId != "usda"
+    prims = (layer.GetPrimAtPath(path) for path in paths if path.IsPrimPath() or path.IsPrimVariantSelectionPath())
+    for spec in filter(None, prims):
+        if binary and None in spec.variantSets.values():  # crashes USD's validators
+            return f"damaged: {spec.path} names variants that do not exist"
+        schemas = spec.GetInfo("apiSchemas").GetAddedOrExplicitItems() if spec.HasInfo("apiSchemas") else ()
+        if len(schemas) > MOST_NAMES:
+            return f"{spec.path} has {len(schemas)} applied API schemas, at most {MOST_NAMES}"
+        clips = spec.GetInfo("clips") if spec.HasInfo("clips") else {}
+        for clip_set in (values for values in clips.values() if isinstance(values, dict)):
+            times = [clip_set.get(f"template{name}", 0.0) for name in ("StartTime", "EndTime", "Stride")]
+            start, end, stride = (time if isinstance(time, float | int) else 0.0 for time in times)
+            if stride and not abs(end - start) / abs(stride) <= MOST_CLIPS:
+                return f"{spec.path} has a template of more than {MOST_CLIPS} clips"
+    return ""
+
+
+def irregular_dependency(path: str | os.PathLike) -> str:
+    """Return :func:`irregular_file` of the first file that a stage names in any layer, variant, clip or attribute."""
+    from pxr import Ar, Sdf, UsdUtils  # noqa: PLC0415 - a parent of a child does without it
+
+    pending, seen = [str(path)], {str(path)}
+    while pending:
+        if reason := irregular_file(Ar.SplitPackageRelativePathOuter(pending[-1])[0]):
+            return reason
+        name = pending.pop()
+        layer = Sdf.Layer.FindOrOpen(name) if Sdf.FileFormat.FindByExtension(name) else None
+        if layer is None:
+            continue
+        if reason := _excess(layer):
+            return reason
+        named = {text for texts in UsdUtils.ExtractExternalReferences(name) for text in texts if text}
+        anchored = {Sdf.ComputeAssetPathRelativeToLayer(layer, text) for text in named}
+        # a template of clips names many files
+        files = {file for text in anchored for file in (glob.glob(re.sub(r"#+", "*", text)) if "#" in text else [text])}
+        pending += sorted(files - seen)
+        seen |= files
+    return ""
+
+
 def _read(path: str, most_prims: int) -> str:  # pragma: no cover - runs in the child
     """Read a stage up to the last value of its layers; return the reason to reject it, or an empty text."""
     from pxr import Sdf, Usd  # noqa: PLC0415 - only the child needs it
 
+    if reason := irregular_dependency(path):
+        return reason
     stage = Usd.Stage.Open(path)
     rates_are_valid = all(1e-6 < layer.timeCodesPerSecond < 1e9 for layer in stage.GetUsedLayers())
     prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies(Usd.PrimAllPrimsPredicate))
@@ -66,12 +134,7 @@ def _read(path: str, most_prims: int) -> str:  # pragma: no cover - runs in the 
             attribute.Get()
             attribute.GetTimeSamples()  # never ends where offsets of layers overflow
     for layer in (layer for layer in stage.GetUsedLayers() if layer.GetFileFormat().formatId != "usda"):
-        copy, paths = Sdf.Layer.CreateAnonymous(".usda"), []
-        copy.TransferContent(layer)
-        layer.Traverse("/", paths.append)
-        for spec in filter(None, (layer.GetPrimAtPath(path) for path in paths if path.IsPrimPath())):
-            if None in spec.variantSets.values():  # crashes USD's validators
-                return f"damaged: {spec.path} names variants that do not exist"
+        Sdf.Layer.CreateAnonymous(".usda").TransferContent(layer)
     return ""
 
 

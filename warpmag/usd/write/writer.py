@@ -26,6 +26,7 @@ from warpmag.usd.read.input_errors import usd_errors
 from warpmag.usd.read.opening import copied_metadata
 from warpmag.usd.read.recording import ORIENT, SCALE, TRANSLATE
 from warpmag.usd.read.session import INSTANCES, added_layer, as_written, instances_around, unsaved_layers
+from warpmag.usd.read.trial_read import trial_read
 from warpmag.usd.read.units import units_of
 from warpmag.usd.write import crate
 from warpmag.usd.write.columns import BODY, MAGNET, Column
@@ -157,7 +158,13 @@ class CacheWriter:
         places = {name[5:]: array for name, array in arrays.items() if name.startswith("file/")}
         state = {name[6:]: array for name, array in arrays.items() if name.startswith("state/")}
         with output.errors(output.cache):
-            self._samples = SampleFile.resume(output.cache, self._value_sizes(), places)
+            samples = SampleFile.resume(output.cache, self._value_sizes(), places)
+        try:
+            self._check_cache()
+        except InputError:
+            samples.close()
+            raise
+        self._samples = samples
         self._first = self._unpack(self._samples.frame(0))
         self._last = self._unpack(self._samples.frame(self._samples.count - 1))
         self._last_time = float(run["time"])
@@ -165,6 +172,14 @@ class CacheWriter:
             output.place(target)
         output.place(output.root)
         return PreviousRun(self._last_time, state)
+
+    def _check_cache(self) -> None:
+        """Raise :class:`InputError` if USD cannot read the cache, for example after damage to the disk."""
+        cache, message = str(self._output.cache), "cannot be resumed, it has changed since the run wrote it"
+        if reason := trial_read(cache):
+            raise InputError(f"{cache}: {message} ({reason})")
+        with usd_errors(cache, message):
+            Sdf.Layer.OpenAsAnonymous(cache)
 
     def _completed(self) -> PreviousRun:
         """Return a complete run, which has no checkpoint."""
