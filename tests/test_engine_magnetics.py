@@ -12,6 +12,8 @@ import warpmag
 from bench.reference import near_contact as contact_oracle
 from bench.reference import oracle
 from warpmag.declarations.magnets import SATURATION_OF_IRON
+from warpmag.engine.magnets.grouping import find_magnets
+from warpmag.engine.magnets.sampling import ShapeSampler
 
 M = 1e6  # A/m
 VOLUME = 4.0 / 3.0 * math.pi * R**3
@@ -320,3 +322,58 @@ def test_meshes_of_the_same_triangles_are_sampled_once(device):
     one, other, longer = (magnet.lattice for magnet in magnetics.magnets)
     assert one is other
     assert longer.volumes.sum() == pytest.approx(1.5 * one.volumes.sum(), rel=1e-2)  # of what cells resolve
+
+
+def nail(builder, lean, stretch=1.0, shift=0.0):
+    """A body of shaft and head, whose frames have the rounding of a body's rotation and back."""
+    body = builder.add_body()
+    turn = wp.quat_from_axis_angle(wp.normalize(wp.vec3(0.3, 1.0, 0.2)), lean)
+    world = wp.transform((0.1 * lean, 0.2, -0.3), turn)
+    for radius, half_height, height in ((0.0015, 0.025 * stretch, 0.025), (0.004, 0.0005, 0.0505 + shift)):
+        placed = wp.transform_multiply(world, wp.transform((0.0, 0.0, height), wp.quat(0.5, 0.5, 0.5, 0.5)))
+        frame = wp.transform_multiply(wp.transform_inverse(world), placed)
+        if lean > 1.5:
+            frame = wp.transform(frame.p, -frame.q)  # the same rotation
+        builder.add_shape_cylinder(body, xform=frame, radius=radius, half_height=half_height)
+    return body
+
+
+def test_shapes_equal_up_to_rounding_are_sampled_once(monkeypatch):
+    builder = new_builder()
+    for lean in np.linspace(0.0, 3.0, 40):
+        warpmag.add_inducible(builder, nail(builder, float(lean)))
+    model = builder.finalize(device="cpu")
+    assert len(np.unique(model.shape_transform.numpy(), axis=0)) > 20
+    sampled, sample = [], ShapeSampler._sample
+
+    def counted(sampler, *arguments):
+        sampled.append(arguments)
+        return sample(sampler, *arguments)
+
+    monkeypatch.setattr(ShapeSampler, "_sample", counted)
+    magnets, _ = find_magnets(model)
+    assert len(magnets) == 40
+    assert len(sampled) == 1
+    assert len({id(magnet.lattice) for magnet in magnets}) == 1
+
+
+@pytest.mark.parametrize("difference", ["stretch", "shift", "lean"])
+def test_shapes_that_differ_by_a_ten_thousandth_are_different(difference):
+    """In length, in place, relative to the body's size, and in angle [rad]; also in a chain of small steps."""
+    builder = new_builder()
+    for k in range(30):
+        step = 3e-6 * k if k < 29 else 1e-4
+        if difference == "lean":
+            body, half = builder.add_body(), 0.5 * step
+            turned = wp.transform((0.0, 0.0, 0.01), wp.quat(float(np.sin(half)), 0.0, 0.0, float(np.cos(half))))
+            builder.add_shape_cylinder(body, xform=turned, radius=0.0015, half_height=0.025)
+        else:
+            size = {"stretch": 1.0, "shift": 0.05}[difference]
+            body = nail(builder, 0.0, **{difference: step * size + (difference == "stretch")})
+        warpmag.add_inducible(builder, body)
+    kinds = ShapeSampler(builder.finalize(device="cpu")).kinds
+    kinds = kinds.reshape(30, -1)
+    assert (kinds[0] != kinds[29]).any()
+    for k in range(28):  # steps of 3e-6 join, but no two shapes 3e-5 apart
+        assert (kinds[k] != kinds[k + 10 : 29]).any(axis=1).all()
+    assert len(np.unique(kinds, axis=0)) < 20

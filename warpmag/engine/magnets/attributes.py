@@ -118,6 +118,25 @@ def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return rows[order[differs]], index
 
 
+def close_rows(labels: np.ndarray, columns: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return a number for each row, equal for rows of equal ``labels`` and nearly equal ``columns``, shape [n].
+
+    Rows with the same number differ by at most ``tolerance`` in every column, shape [n, m]. Groups of rows that are
+    farther apart than this, and narrower, are always recognized: no fixed grid cuts them.
+    """
+    for column in columns.T:
+        order = np.lexsort((column, labels))
+        sorted_labels, values = labels[order], column[order]
+        first = np.ones(len(order), bool)
+        first[1:] = (sorted_labels[1:] != sorted_labels[:-1]) | ~(values[1:] - values[:-1] <= tolerance)
+        group = np.cumsum(first) - 1
+        part = np.floor((values - values[first][group]) / tolerance)  # above 0 only in a group that is too wide
+        first[1:] |= part[1:] != part[:-1]
+        labels = np.empty_like(group)
+        labels[order] = np.cumsum(first) - 1
+    return labels
+
+
 def _magnet_of(values: list[np.ndarray]) -> Magnet:
     """Return the magnet of the stored values of one shape, in the order of ``MAGNET_ATTRIBUTES``."""
     fields = {}

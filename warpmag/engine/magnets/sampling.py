@@ -8,7 +8,8 @@ import numpy as np
 import warp as wp
 
 from warpmag.declarations.magnets import Magnet
-from warpmag.engine.magnets.attributes import unique_rows
+from warpmag.declarations.rotations import rotate
+from warpmag.engine.magnets.attributes import close_rows, unique_rows
 from warpmag.errors import InputError
 from warpmag.moments.arrays import RADIUS_RANGE
 from warpmag.shapes import lattice, polyhedra
@@ -19,6 +20,9 @@ from warpmag.shapes.uniform_response import with_surface_response
 
 _REACH = 3.0
 """Distance up to which the closed form of a magnet replaces its lattice of cells, in cell sizes."""
+_ROUNDING = 1e-5
+"""Relative difference up to which sizes and frames of shapes are equal: 80 units in the last place of float32. Frames
+come from products of transforms, which round differently for each instance of a prototype."""
 _SOLIDS = {
     newton.GeoType.SPHERE: (lattice.sphere, 1),
     newton.GeoType.CAPSULE: (lattice.capsule, 2),
@@ -53,7 +57,7 @@ class BodyLattice:
 
 
 class ShapeSampler:
-    """Samples the shapes of one model. Equal shapes, for example in replicated worlds, are sampled once."""
+    """Samples the shapes of one model. Equal shapes, for example instances of a prototype, are sampled once."""
 
     def __init__(self, model: newton.Model):
         """Read the geometry of ``model``."""
@@ -61,8 +65,12 @@ class ShapeSampler:
         self._labels, self._sources = model.shape_label, model.shape_source[: model.shape_count]
         self._types, self._scales = model.shape_type.numpy(), model.shape_scale.numpy().astype(float)
         self._frames = model.shape_transform.numpy().astype(float)
-        numbers = np.column_stack([self._types, _number_sources(self._sources), self._scales, self._frames])
-        self.kinds = unique_rows(numbers)[1]
+        numbers, reaches = _number_sources(self._sources)
+        sizes = np.abs(reaches * self._scales).max(axis=1)
+        sizes[~(sizes > 0.0)] = 1.0  # an infinite plane has the scale 0
+        columns = [self._types, numbers, sizes, _largest(sizes, model.shape_body.numpy()), self._scales, self._frames]
+        rows, row_of = unique_rows(np.column_stack(columns))
+        self.kinds = _kinds(*np.split(rows, (2, 3, 4, 7, 10), axis=1))[row_of]
         self._lattices: dict[tuple, BodyLattice] = {}
 
     def sample(self, shapes: list[int], magnet: Magnet) -> BodyLattice:
@@ -154,17 +162,46 @@ def solid_of(kind: int, scale: np.ndarray, source: Any) -> lattice.Solid:
     return make(scale) if lengths == 3 else make(*scale[:lengths])
 
 
-def _number_sources(sources: list) -> list[int]:
-    """Return a number for each geometry source: 0 for None, equal for meshes of equal points and triangles."""
+def _number_sources(sources: list) -> tuple[list[int], list[np.ndarray]]:
+    """Return a number for each geometry source, and its largest coordinates [m], shape [3], before it is scaled.
+
+    The number is 0 for None, and equal for meshes of equal points and triangles. A source without points has ones.
+    """
     number_of_contents: dict[Any, int] = {}
-    number_of_object: dict[int, int] = {id(None): 0}
+    of_object: dict[int, tuple[int, np.ndarray]] = {id(None): (0, np.ones(3))}
     for source in sources:
-        if id(source) not in number_of_object:
-            contents = id(source)
+        if id(source) not in of_object:
+            contents, reach = id(source), np.ones(3)
             if hasattr(source, "vertices"):
-                contents = tuple(np.asarray(array).tobytes() for array in (source.vertices, source.indices))
-            number_of_object[id(source)] = number_of_contents.setdefault(contents, 1 + len(number_of_contents))
-    return [number_of_object[id(source)] for source in sources]
+                points = np.asarray(source.vertices, float).reshape(-1, 3)
+                contents = points.tobytes(), np.asarray(source.indices).tobytes()
+                reach = np.abs(points).max(axis=0, initial=0.0)
+            of_object[id(source)] = number_of_contents.setdefault(contents, 1 + len(number_of_contents)), reach
+    numbers, reaches = zip(*(of_object[id(source)] for source in sources), strict=True)
+    return list(numbers), list(reaches)
+
+
+def _largest(sizes: np.ndarray, bodies: np.ndarray) -> np.ndarray:
+    """Return the largest size of the shapes of each shape's body, or its own size without a body, shape [n]."""
+    moves = bodies >= 0
+    largest = np.zeros(bodies.max() + 1)
+    np.maximum.at(largest, bodies[moves], sizes[moves])
+    result = sizes.copy()
+    result[moves] = largest[bodies[moves]]
+    return result
+
+
+def _kinds(exact: np.ndarray, sizes, body_sizes, scales, positions, quaternions: np.ndarray) -> np.ndarray:
+    """Return a number for each shape, equal for equal shapes in equal frames, up to rounding, shape [n].
+
+    ``exact`` are integers, shape [n, 2]. Lengths are relative to the size of the shape, positions to the larger of the
+    size of the body and the distance from its origin. Rotations are compared as matrices, because q and −q are equal.
+    """
+    largest = np.abs(scales).max(axis=1, keepdims=True)
+    shapes = [np.log(sizes), scales / np.where(largest > 0.0, largest, 1.0)]
+    axes = [rotate(quaternions, np.broadcast_to(axis, positions.shape)) for axis in np.eye(3)]
+    columns = np.concatenate([*shapes, np.arcsinh(positions / body_sizes), *axes], axis=1)
+    return close_rows(unique_rows(exact)[1], columns, _ROUNDING)
 
 
 def _within_range(sampled: BodyLattice) -> BodyLattice:
