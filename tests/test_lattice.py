@@ -1,11 +1,13 @@
 """Lattices of moments against closed forms of the solids they stand for, and against magpylib's exact fields."""
 
+from dataclasses import replace
+
 import magpylib
 import numpy as np
 import pytest
 
 from warpmag.errors import InputError
-from warpmag.shapes import facets, lattice
+from warpmag.shapes import cell_grid, facets, lattice
 
 TILT = (0.3, -0.2, 0.5, 0.7)
 
@@ -283,3 +285,57 @@ def test_bad_input_is_named(call, named):
     with pytest.raises(InputError, match=named) as caught:
         call()
     assert "\n" not in str(caught.value)
+
+
+def turned_solids():
+    """Shapes in frames of their own, so that a common grid is along the axes of none of them but the largest."""
+    return [lattice.box([0.03, 0.01, 0.01]), lattice.cone(0.01, 0.016).posed((0.02, 0.0, 0.0), TILT)]
+
+
+@pytest.mark.parametrize("name", [*SOLIDS, "torus", "concave", "several"])
+def test_points_along_the_axes_fill_the_cells_that_single_points_fill(name):
+    """The grid of test points of a shape in its own frame, against the same points one by one."""
+    outline = np.array([[0, 0], [3, 0], [3, 1], [1, 1], [1, 2], [0, 2]]) * 0.01
+    meshes = {
+        "torus": lattice.mesh(*torus_mesh(0.02, 0.008)),
+        "concave": lattice.mesh(*prism(outline, [(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)], 0.01)),
+    }
+    solids = turned_solids()[::-1] if name == "several" else [meshes.get(name) or SOLIDS[name][0]]
+    cells = cell_grid.cells_over(solids, [], 0.004, 3)
+    part, others = cells.solids[-1], cells.solids[:-1]
+    index, hits, count = cells._hits(part, others)
+    index_of_axes, hits_of_axes, count_of_axes = cells._hits_along_axes(part, others)
+    assert count > 1000
+    np.testing.assert_array_equal(index_of_axes, index)
+    np.testing.assert_array_equal(hits_of_axes, hits)
+    assert count_of_axes == count
+
+
+def test_blocks_of_test_points_never_show(monkeypatch):
+    cells = cell_grid.cells_over([lattice.mesh(*torus_mesh(0.02, 0.008))], [], 0.002, 1)
+    whole = cells.filled(0)
+    for chunk in (1, 3000, 30000):  # a line of cells, a few lines, a few layers at a time
+        monkeypatch.setattr(cell_grid, "_CHUNK", chunk)
+        parts = cells.filled(0)
+        np.testing.assert_array_equal(parts.index, whole.index)
+        np.testing.assert_array_equal(parts.shares, whole.shares)
+
+
+@pytest.mark.parametrize("kind", ["cylinder", "mesh"])
+def test_a_wire_takes_few_test_points(kind, monkeypatch):
+    """Aspect ratio 10,000. The rays of a mesh are along the wire: 32² in its width, whatever its length."""
+    angle = 2.0 * np.pi * np.arange(24) / 24
+    outline = 1e-4 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    made = prism(outline, [(0, k, k + 1) for k in range(1, 23)], 2.0)
+    solid = lattice.cylinder(1e-4, 1.0) if kind == "cylinder" else lattice.mesh(*made)
+    rays = []
+
+    def inside(x, y, z, inside=solid.inside):
+        rays.append(np.broadcast(x, y).size)
+        return inside(x, y, z)
+
+    body = lattice.fill(replace(solid, inside=inside))
+    assert 0.9 * lattice.AUTOMATIC_COUNT < len(body.volumes) <= lattice.AUTOMATIC_COUNT
+    assert body.volumes.sum() == pytest.approx(solid.volume, rel=1e-12)
+    assert max(rays) <= 32**2
+    np.testing.assert_allclose(body.positions[:, :2], 0.0, atol=1e-12)  # on the axis

@@ -27,7 +27,7 @@ class Filled:
     shares: np.ndarray  # filled share of each subcell, shape [m, a, b, c]
     weights: np.ndarray  # number of test points of each cell in the filled part, shape [m]
     sums: np.ndarray  # sum of the positions of these points [m], frame of the grid, shape [m, 3]
-    point_count: float  # number of test points in the shape, including overlap with earlier shapes
+    point_count: int  # number of test points in the shape, including overlap with earlier shapes
 
 
 @dataclass(frozen=True)
@@ -50,29 +50,75 @@ class CellGrid:
         pitch = np.abs(part.rotation).T @ (self.sides / self.splits)
         if (part.upper - part.lower < 2.0 * pitch).any():
             return self._filled_by_thin_shape(part, others, pitch)
-        index = self._cells_near(part)
+        in_own_frame = not part.position.any() and (part.rotation == np.eye(3)).all()
+        index, hits, point_count = self._hits_along_axes(part, others) if in_own_frame else self._hits(part, others)
+        weights, shares = np.count_nonzero(hits, axis=1).astype(float), hits.astype(float)
+        sums = weights[:, None] * (self.lower + (index + 0.5) * self.sides) + shares @ self._offsets()
+        return Filled(index, shares.reshape(-1, *self.splits), weights, sums, point_count)
+
+    def _offsets(self) -> np.ndarray:
+        """Return the test points of a cell relative to its center [m], shape [points, 3]."""
+        return ((grid(self.splits) + 0.5) / self.splits - 0.5) * self.sides
+
+    def _hits_along_axes(self, part: Solid, others: list[Solid]) -> tuple[np.ndarray, np.ndarray, int]:
+        """Return :meth:`_hits` of a shape in the frame of the grid, whose test points are a grid along its axes."""
+        first = np.maximum(np.floor((part.lower - self.lower) / self.sides).astype(int) - 1, 0)
+        last = np.minimum(np.ceil((part.upper - self.lower) / self.sides).astype(int) + 1, self.counts)
+        size = int(self.splits.prod())
+        deep, rows, columns = size * (last - first)[2], *(last - first)[:2]
+        high = min(rows, max(1, _CHUNK // (columns * deep)))
+        wide = columns if high > 1 else min(columns, max(1, _CHUNK // deep))  # blocks in the order of the cells
+        index, hits, point_count = [np.empty((0, 3), int)], [np.empty((0, size), bool)], 0
+        for i, j in ((i, j) for i in range(first[0], last[0], high) for j in range(first[1], last[1], wide)):
+            begin = np.array([i, j, first[2]])
+            end = np.minimum([i + high, j + wide, last[2]], last)
+            x, y, z = (self._test_coordinates(axis, begin[axis], end[axis]) for axis in range(3))
+            free = part.contains_grid(x, y, z)
+            point_count += int(np.count_nonzero(free))
+            for other in others:
+                a, b, c = np.nonzero(free)
+                free[a, b, c] = ~other.contains(np.stack([x[a], y[b], z[c]], axis=1))
+            cells = np.stack([end - begin, self.splits], axis=1).reshape(-1)
+            block = free.reshape(cells).transpose(0, 2, 4, 1, 3, 5).reshape(-1, size)
+            used = np.flatnonzero(block.any(axis=1))
+            index.append(np.stack(np.unravel_index(used, end - begin), axis=1) + begin)
+            hits.append(block[used])
+        return np.concatenate(index), np.concatenate(hits), point_count
+
+    def _test_coordinates(self, axis: int, begin: int, end: int) -> np.ndarray:
+        """Return the coordinates [m] of the test points of the cells from ``begin`` to ``end`` along an axis."""
+        side, split = self.sides[axis], self.splits[axis]
+        centers = self.lower[axis] + (np.arange(begin, end) + 0.5) * side
+        return (centers[:, None] + ((np.arange(split) + 0.5) / split - 0.5) * side).reshape(-1)
+
+    def _hits(self, part: Solid, others: list[Solid]) -> tuple[np.ndarray, np.ndarray, int]:
+        """Return the cells with a test point in a shape outside ``others``, shape [m, 3], and these points.
+
+        Points in the shape are marked, shape [m, points of a cell]. The third value is the number of points in the
+        shape, including overlap.
+        """
+        index, offsets = self._cells_near(part), self._offsets()
         cells = self.lower + (index + 0.5) * self.sides
-        offsets = ((grid(self.splits) + 0.5) / self.splits - 0.5) * self.sides
-        hits, sums, point_count = np.empty((len(cells), len(offsets)), bool), np.empty((len(cells), 3)), 0.0
+        hits, point_count = np.empty((len(cells), len(offsets)), bool), 0
         step = max(1, _CHUNK // len(offsets))
         for start in range(0, len(cells), step):
             chunk = cells[start : start + step]
-            points = (chunk[:, None, :] + offsets).reshape(-1, 3)
-            inside, free = _inside(part, others, points)
+            inside, free = _inside(part, others, (chunk[:, None, :] + offsets).reshape(-1, 3))
             point_count += inside
-            free = hits[start : start + step] = free.reshape(len(chunk), -1)
-            sums[start : start + step] = free.sum(axis=1)[:, None] * chunk + free @ offsets
+            hits[start : start + step] = free.reshape(len(chunk), -1)
         used = hits.any(axis=1)
-        weights = hits[used].sum(axis=1).astype(float)
-        return Filled(index[used], hits[used].reshape(-1, *self.splits).astype(float), weights, sums[used], point_count)
+        return index[used], hits[used], point_count
 
     def _cells_near(self, part: Solid) -> np.ndarray:
         """Return the sorted indices of the cells that the rotated bounding box of a shape reaches into."""
         rotation, extent = np.abs(part.rotation), part.upper - part.lower
         steps = (0.5 * self.sides[:, None] / np.maximum(rotation, 1e-9)).min(axis=0)  # along each axis of the shape
         points = part.test_points(np.ceil(extent / steps).astype(int))
-        index = np.unique(np.floor((points - self.lower) / self.sides).astype(int), axis=0)
-        index = np.unique((index[:, None] + grid(np.full(3, 3)) - 1).reshape(-1, 3), axis=0)  # with their neighbors
+        index, size = np.floor((points - self.lower) / self.sides).astype(int), self.counts + 4
+        index = np.clip(index, -2, self.counts + 1) + 2  # not negative, even of the neighbors
+        index = np.stack(np.unravel_index(np.unique(np.ravel_multi_index(tuple(index.T), size)), size), axis=1)
+        index = np.clip(index[:, None] + grid(np.full(3, 3)) - 1, 0, size - 1).reshape(-1, 3)  # with their neighbors
+        index = np.stack(np.unravel_index(np.unique(np.ravel_multi_index(tuple(index.T), size)), size), axis=1) - 2
         index = index[((index >= 0) & (index < self.counts)).all(axis=1)]
         center = (self.lower + (index + 0.5) * self.sides - part.position) @ part.rotation
         reach = 0.5 * (extent + self.sides @ rotation) * (1.0 - 1e-9)

@@ -1,5 +1,6 @@
 """Closed triangle meshes: check that they are closed, and winding numbers of points."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from warpmag.errors import InputError
 
 _CHUNK = 1 << 18
-"""Pairs of a point and a triangle evaluated at a time (some tens of MB)."""
+"""Pairs of a ray and a triangle evaluated at a time (some tens of MB)."""
 
 
 def welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -43,12 +44,40 @@ def check_closed(triangles: np.ndarray) -> None:
         )
 
 
-def winding_number(points: np.ndarray, triangles: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function of points that returns the winding number of a closed mesh about each point.
+def winding_number(points: np.ndarray, triangles: np.ndarray) -> Callable[..., np.ndarray]:
+    """Return a function of coordinates x, y, z that returns the winding number of a closed mesh about each point.
+
+    The coordinates broadcast. In a grid along the axes, all points of a line along z share a ray.
 
     The function counts the triangles that a ray along +z crosses. A ray through an edge or a vertex counts exactly
     once: the side of an edge is computed from its end points in the order of their indices, and is thus the same for
-    both triangles. Triangles are sorted into rectangular columns along z: a point tests the triangles of its column.
+    both triangles. Triangles are sorted into rectangular columns along z: a ray tests the triangles of its column.
+    """
+    crossings = _ray_crossings(points, triangles)
+
+    def winding(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+        x, y = np.broadcast_arrays(x, y)
+        shape = np.broadcast_shapes(x.shape, z.shape)
+        height, sign, count = crossings(np.stack([x.reshape(-1), y.reshape(-1)], axis=1))
+        result, start = (
+            np.zeros((len(count), math.prod(shape) // max(1, len(count))), np.int16),
+            np.cumsum(count) - count,
+        )
+        z = z.reshape(-1, result.shape[1])  # one row for all rays, or one for each
+        for k in range(int(count.max(initial=0))):  # the crossing k of each ray
+            rays = np.flatnonzero(count > k)
+            crossing = start[rays] + k
+            above = height[crossing, None] > (z if len(z) == 1 else z[rays])
+            result[rays] += above * sign[crossing, None]
+        return result.reshape(shape)
+
+    return winding
+
+
+def _ray_crossings(points: np.ndarray, triangles: np.ndarray) -> Callable[[np.ndarray], tuple[np.ndarray, ...]]:
+    """Return a function of rays along z through (x, y), shape [n, 2], that returns where they cross a mesh.
+
+    It returns z [m] and the sign of the normal's z of each crossing, by ray, and the number of crossings of each ray.
     """
     corners = points[triangles]
     flat = corners[:, :, :2]
@@ -69,33 +98,32 @@ def winding_number(points: np.ndarray, triangles: np.ndarray) -> Callable[[np.nd
     forward = triangles == low
     origin, direction = points[low, :2], points[high, :2] - points[low, :2]
 
-    def winding(p: np.ndarray) -> np.ndarray:
-        xy = np.clip(((p[:, :2] - lower) / width).astype(int), 0, columns - 1)
+    def crossings(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        xy = np.clip(((rays - lower) / width).astype(int), 0, columns - 1)
         column = xy[:, 0] * columns + xy[:, 1]
-        result = np.zeros(len(p), int)
+        heights, signs, counts = [np.empty(0)], [np.empty(0, np.int8)], np.zeros(len(rays), int)
         ends = np.cumsum(sizes[column])
         begin = 0
-        while begin < len(p):
+        while begin < len(rays):
             done = ends[begin - 1] if begin else 0
             stop = max(begin + 1, int(np.searchsorted(ends, done + _CHUNK, side="right")))
             rows = np.arange(begin, stop)
-            point = np.repeat(rows, sizes[column[rows]])
-            t = entries[starts[column[point]] + _counters(sizes[column[rows]])]
-            offset = p[point, None, :2] - origin[t]
+            ray = np.repeat(rows, sizes[column[rows]])
+            t = entries[starts[column[ray]] + _counters(sizes[column[rows]])]
+            offset = rays[ray, None] - origin[t]
             side = direction[t, :, 0] * offset[:, :, 1] - direction[t, :, 1] * offset[:, :, 0]
             left = (side >= 0.0) == forward[t]
             up, down = left.all(axis=1), ~left.any(axis=1)
             crossed = np.flatnonzero(up | down)
             opposite = np.abs(side[crossed][:, [1, 2, 0]])  # edge k, from corner k to k + 1, faces corner k + 2
             total = opposite.sum(axis=1)
-            height = (opposite * corners[t[crossed], :, 2]).sum(axis=1) / np.where(total > 0.0, total, 1.0)
-            above = height > p[point[crossed], 2]
-            sign = np.where(up[crossed], 1, -1) * above
-            result[begin:stop] = np.bincount(point[crossed] - begin, sign, minlength=stop - begin).astype(int)
+            heights.append((opposite * corners[t[crossed], :, 2]).sum(axis=1) / np.where(total > 0.0, total, 1.0))
+            signs.append(np.where(up[crossed], 1, -1).astype(np.int8))
+            counts[begin:stop] = np.bincount(ray[crossed] - begin, minlength=stop - begin)
             begin = stop
-        return result
+        return np.concatenate(heights), np.concatenate(signs), counts
 
-    return winding
+    return crossings
 
 
 def _counters(counts: np.ndarray) -> np.ndarray:

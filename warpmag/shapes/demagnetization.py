@@ -313,7 +313,14 @@ def _piece_tensors(part: Pieces, p: np.ndarray, q: np.ndarray) -> np.ndarray:
     result[both_full] = cuboid_tensors(offsets, part.sides)[inverse.reshape(-1)]
     if len(cut):
         filled = _binary(_coarsened(part.filled, _SUBCELLS))
-        result[cut] = _cut_tensors(part.sides, filled, p[cut], q[cut], separation[cut])
+        patterns, pattern = np.unique(filled.reshape(len(filled), -1), axis=0, return_inverse=True)
+        # pieces repeat along a rod and over a plate: each pair of patterns is evaluated once at each offset
+        pattern, shift = pattern.reshape(-1), separation[cut] - separation[cut].min(axis=0)
+        columns = pattern[p[cut]], pattern[q[cut]], *shift.T
+        rows = np.ravel_multi_index(columns, (len(patterns), len(patterns), *(shift.max(axis=0) + 1)))
+        _, first, inverse = np.unique(rows, return_index=True, return_inverse=True)
+        patterns, offsets = patterns.reshape(-1, *filled.shape[1:]), separation[cut][first]
+        result[cut] = _cut_tensors(part.sides, patterns, columns[0][first], columns[1][first], offsets)[inverse]
     return result
 
 

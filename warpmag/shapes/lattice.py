@@ -115,8 +115,11 @@ class Lattice:
 def box(half_extents: Values) -> Solid:
     """Return a box of half sides ``half_extents`` [m], shape [3], centered at the origin."""
     h = _lengths("box: half_extents", half_extents, 3)
-    inside, surface = (lambda p: np.abs(p / h).max(axis=1) <= 1.0), partial(facets.box, h)
-    return Solid("box", -h, h, float(8.0 * h.prod()), np.zeros(3), inside, surface)
+
+    def inside(x, y, z):
+        return (np.abs(x / h[0]) <= 1.0) & (np.abs(y / h[1]) <= 1.0) & (np.abs(z / h[2]) <= 1.0)
+
+    return Solid("box", -h, h, float(8.0 * h.prod()), np.zeros(3), inside, partial(facets.box, h))
 
 
 def sphere(radius: float) -> Solid:
@@ -129,16 +132,19 @@ def ellipsoid(semi_axes: Values) -> Solid:
     """Return an ellipsoid of ``semi_axes`` [m], shape [3], centered at the origin."""
     a = _lengths("ellipsoid: semi_axes", semi_axes, 3)
     volume = 4.0 / 3.0 * np.pi * float(a.prod())
-    inside, surface = (lambda p: ((p / a) ** 2).sum(axis=1) <= 1.0), partial(facets.ellipsoid, a)
-    return Solid("ellipsoid", -a, a, volume, np.zeros(3), inside, surface)
+
+    def inside(x, y, z):
+        return (x / a[0]) ** 2 + (y / a[1]) ** 2 + (z / a[2]) ** 2 <= 1.0
+
+    return Solid("ellipsoid", -a, a, volume, np.zeros(3), inside, partial(facets.ellipsoid, a))
 
 
 def capsule(radius: float, half_height: float) -> Solid:
     """Return a capsule along z: a cylinder of ``radius`` and ``half_height`` [m] with a hemisphere at each end."""
     r, h = _lengths("capsule: radius and half_height", [radius, half_height], 2)
 
-    def inside(p):
-        return p[:, 0] ** 2 + p[:, 1] ** 2 + np.maximum(np.abs(p[:, 2]) - h, 0.0) ** 2 <= r * r
+    def inside(x, y, z):
+        return x**2 + y**2 + np.maximum(np.abs(z) - h, 0.0) ** 2 <= r * r
 
     upper = np.array([r, r, h + r])
     volume, surface = np.pi * r * r * (2.0 * h + 4.0 / 3.0 * r), partial(facets.capsule, r, h)
@@ -149,8 +155,8 @@ def cylinder(radius: float, half_height: float) -> Solid:
     """Return a cylinder along z of ``radius`` and ``half_height`` [m], centered at the origin."""
     r, h = _lengths("cylinder: radius and half_height", [radius, half_height], 2)
 
-    def inside(p):
-        return (p[:, 0] ** 2 + p[:, 1] ** 2 <= r * r) & (np.abs(p[:, 2]) <= h)
+    def inside(x, y, z):
+        return (x**2 + y**2 <= r * r) & (np.abs(z) <= h)
 
     upper = np.array([r, r, h])
     volume, surface = 2.0 * np.pi * r * r * h, partial(facets.cylinder, r, h)
@@ -161,9 +167,9 @@ def cone(radius: float, half_height: float) -> Solid:
     """Return a cone along z: base of ``radius`` [m] at z = −``half_height`` [m], tip at +``half_height``."""
     r, h = _lengths("cone: radius and half_height", [radius, half_height], 2)
 
-    def inside(p):
-        width = r * (h - p[:, 2]) / (2.0 * h)
-        return (p[:, 0] ** 2 + p[:, 1] ** 2 <= width * width) & (np.abs(p[:, 2]) <= h)
+    def inside(x, y, z):
+        width = r * (h - z) / (2.0 * h)
+        return (x**2 + y**2 <= width * width) & (np.abs(z) <= h)
 
     upper = np.array([r, r, h])
     volume, surface = 2.0 / 3.0 * np.pi * r * r * h, partial(facets.cone, r, h)
@@ -189,15 +195,15 @@ def mesh(vertices: np.ndarray, faces: np.ndarray) -> Solid:
     centroid = middle + (parts[:, None] * local.sum(axis=1)).sum(axis=0) / (4.0 * volume)
     winding = winding_number(points, triangles if volume > 0.0 else triangles[:, ::-1])
     surface = partial(facets.mesh, corners if volume > 0.0 else corners[:, ::-1])
-    solid = Solid("mesh", lower, upper, abs(volume), centroid, lambda p: winding(p) != 0, surface)
-    samples = solid.test_points(np.full(3, _FINE_POINTS))
-    windings = winding(samples)
+    solid = Solid("mesh", lower, upper, abs(volume), centroid, lambda x, y, z: winding(x, y, z) != 0, surface)
+    samples = lower + (np.arange(_FINE_POINTS)[:, None] + 0.5) * ((upper - lower) / _FINE_POINTS)
+    windings = winding(*np.ix_(*samples.T))
     if np.isin(windings, (0, 1)).all():
         return solid
     inside = windings != 0  # intersecting shells: the integrals above count shared volume repeatedly
-    return replace(
-        solid, volume=abs(volume) * float(inside.sum()) / float(windings.sum()), centroid=samples[inside].mean(axis=0)
-    )
+    volume = abs(volume) * float(inside.sum()) / float(windings.sum())
+    centroid = np.array([samples[rows, k].mean() for k, rows in enumerate(np.nonzero(inside))])
+    return replace(solid, volume=volume, centroid=centroid)
 
 
 def ball(radius: float) -> Lattice:
@@ -303,7 +309,7 @@ def _concatenated(pieces: list[Pieces]) -> Pieces:
 def _fill_part(cells: CellGrid, k: int) -> tuple[np.ndarray, np.ndarray, Pieces]:
     """Return positions [m], body frame, volumes [m³] and pieces of shape ``k``'s moments outside earlier shapes."""
     part, filled = cells.solids[k], cells.filled(k)
-    if filled.point_count == 0.0:
+    if filled.point_count == 0:
         raise InputError(f"{part.name}: too thin to be filled with moments")
     positions, weights, (piece, moment, share) = _joined(filled) if len(filled.index) else _NO_MOMENTS
     if filled.weights.sum() == filled.point_count:  # no overlap: the exact centroid is known

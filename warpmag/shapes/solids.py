@@ -19,7 +19,7 @@ class Solid:
     upper: np.ndarray  # upper corner of the bounding box [m], shape [3]
     volume: float  # [m³]
     centroid: np.ndarray  # [m], shape [3]
-    inside: Callable[[np.ndarray], np.ndarray]  # True for each point inside, from points [m], shape [n, 3]
+    inside: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # True inside, from x, y, z [m] that broadcast
     facets: Callable[[int], np.ndarray]  # about a given number m of facets of the surface [m], shape [m, 4, 3]
     position: np.ndarray = field(default_factory=lambda: np.zeros(3))  # origin in the body's frame [m], shape [3]
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))  # rotation to the body's frame, shape [3, 3]
@@ -52,7 +52,20 @@ class Solid:
         local = (points - self.position) @ self.rotation
         in_box = np.flatnonzero(((local >= self.lower) & (local <= self.upper)).all(axis=1))
         result = np.zeros(len(points), bool)
-        result[in_box] = self.inside(local[in_box])
+        result[in_box] = self.inside(*local[in_box].T)
+        return result
+
+    def contains_grid(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Return :meth:`contains` of the points of a grid along the axes of the shape, shape [len(x), len(y), len(z)].
+
+        Coordinates [m] ascend and are in the frame of the shape, shape [n] each.
+        """
+        values, result = (x, y, z), np.zeros((len(x), len(y), len(z)), bool)
+        limits = zip(values, self.lower, self.upper, strict=True)
+        rows = [slice(v.searchsorted(low), v.searchsorted(up, side="right")) for v, low, up in limits]
+        if all(row.start < row.stop for row in rows):
+            x, y, z = np.ix_(*(v[row] for v, row in zip(values, rows, strict=True)))
+            result[tuple(rows)] = self.inside(x, y, z)
         return result
 
 

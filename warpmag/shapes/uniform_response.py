@@ -4,8 +4,8 @@ Cells of uniform magnetization (``demagnetization.py``) take too small a moment.
 with one or two cells across a sheet or across the strokes of a letter. The response of an ideally permeable body
 follows from its surface alone, which is at one potential: (1/4π) ∫ σ/‖x − y‖ dA = ψ. In a uniform field H0, ψ = H0·x,
 and the moment is ∫ σ x dA. The charge σ is taken as constant on facets (``facets.py``). The potential of a facet is a
-closed form (Wilton et al., IEEE Trans. Antennas Propag. 32 (1984) 276). The response of the cells is computed by
-conjugate gradients.
+closed form (Wilton et al., IEEE Trans. Antennas Propag. 32 (1984) 276). The response of the cells is solved
+directly, or by conjugate gradients if there are many.
 
 Let P be the polarizability of the cells, Q the polarizability of the surface, and N the operator of the cells. The
 correction replaces N by N − E C Eᵀ, where C = P⁻¹ − Q⁻¹ and the columns of E are uniform fields. It adds a field of C
@@ -24,7 +24,7 @@ import numpy as np
 
 from warpmag.shapes import facets
 from warpmag.shapes.ball_pairs import radial_factors
-from warpmag.shapes.demagnetization import Coupling, common_fields, full_tensors
+from warpmag.shapes.demagnetization import COMPONENTS, Coupling, common_fields, full_tensors
 from warpmag.shapes.lattice import Lattice
 from warpmag.shapes.solids import Solid
 
@@ -53,6 +53,9 @@ _RESIDUAL = 1e-3
 """Relative residual of the cells' magnetization. The moment's error is its square over the smallest eigenvalue."""
 _MOST_STEPS = 1000
 """Largest number of steps of conjugate gradients; rods of 1:10 take about 60."""
+_MATRIX_CELLS = 1000
+"""Largest number of cells whose response is solved directly, with a matrix of 72 MB: exact also for wires, for which
+conjugate gradients do not converge. Each costs about 1 s at this number."""
 _CHUNK = 1 << 18
 """Pairs of facets evaluated at a time (some tens of MB)."""
 
@@ -181,8 +184,19 @@ def cell_polarizability(coupling: Coupling, lattice: Lattice) -> np.ndarray:
 
     Pairs of cells without an entry in the coupling act on each other as dipoles.
     """
-    apply, root = _cell_operator(coupling, lattice), np.sqrt(lattice.volumes)[:, None, None]
+    root = np.sqrt(lattice.volumes)[:, None, None]
     fields = root * common_fields(coupling.scaled_positions)[:, :, : _field_count(coupling)]
+    if len(fields) <= _MATRIX_CELLS:
+        columns = fields.reshape(3 * len(fields), -1)
+        moments = columns.T @ np.linalg.solve(_cell_matrix(coupling, lattice), columns)
+    else:
+        solution, residual = _conjugate_gradients(_cell_operator(coupling, lattice), fields)
+        moments = np.einsum("nkl,nkm->lm", solution, fields + residual)  # second order in the residual
+    return 0.5 * (moments + moments.T)
+
+
+def _conjugate_gradients(apply, fields: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return solutions of N M = H for the operator ``apply`` and ``fields`` H, and the residuals, shape [n, 3, k]."""
     solution, residual = np.zeros_like(fields), fields
     search, squared_norm = residual, (residual**2).sum(axis=(0, 1))
     goal = _RESIDUAL**2 * squared_norm
@@ -195,8 +209,7 @@ def cell_polarizability(coupling: Coupling, lattice: Lattice) -> np.ndarray:
         solution, residual = solution + step * search, residual - step * image
         squared_norm, previous = (residual**2).sum(axis=(0, 1)), squared_norm
         search = residual + np.where(unfinished, squared_norm / previous, 0.0) * search
-    moments = np.einsum("nkl,nkm->lm", solution, fields + residual)  # second order in the residual
-    return 0.5 * (moments + moments.T)
+    return solution, residual
 
 
 def _cell_operator(coupling: Coupling, lattice: Lattice):
@@ -204,16 +217,8 @@ def _cell_operator(coupling: Coupling, lattice: Lattice):
 
     With r = x − y, each term of r(r·m) becomes a sum over y, computed as a product of matrices.
     """
-    unit, n = float(lattice.radii.max()), len(lattice.volumes)
-    x, radii = (lattice.positions - lattice.positions.mean(axis=0)) / unit, lattice.radii / unit
-    root, tensors = np.sqrt(lattice.volumes / unit**3), full_tensors(coupling.tensor) * unit**3
-    isotropic, dipolar = np.empty((2, n, n))  # factors of m and of r (r·m)
-    step = max(1, _CHUNK // n)
-    for start in range(0, n, step):
-        rows = slice(start, start + step)
-        distances = np.linalg.norm(x[rows, None] - x, axis=2)
-        isotropic[rows], dipolar[rows] = radial_factors(distances, radii[rows, None], radii)
-    isotropic[np.arange(n), np.arange(n)], dipolar[np.arange(n), np.arange(n)] = -1.0 / radii**3, 0.0
+    x, root, isotropic, dipolar, tensors = _pair_factors(coupling, lattice)
+    n = len(x)
 
     def apply(scaled: np.ndarray) -> np.ndarray:
         m = scaled * root[:, None, None]
@@ -229,6 +234,37 @@ def _cell_operator(coupling: Coupling, lattice: Lattice):
         return -field * root[:, None, None]
 
     return apply
+
+
+def _cell_matrix(coupling: Coupling, lattice: Lattice) -> np.ndarray:
+    """Return the operator of :func:`_cell_operator` as a matrix, shape [3 n, 3 n]."""
+    x, root, isotropic, dipolar, tensors = _pair_factors(coupling, lattice)
+    n = len(x)
+    matrix = np.empty((n, 3, n, 3))
+    for k, j in zip(*COMPONENTS, strict=True):
+        block = dipolar * (x[:, None, k] - x[:, k]) * (x[:, None, j] - x[:, j]) + (isotropic if k == j else 0.0)
+        matrix[:, k, :, j] = matrix[:, j, :, k] = block / (4.0 * np.pi)
+    matrix[np.repeat(np.arange(n), np.diff(coupling.start)), :, coupling.other] += tensors
+    matrix *= -root[:, None, None, None] * root[:, None]
+    return matrix.reshape(3 * n, 3 * n)
+
+
+def _pair_factors(coupling: Coupling, lattice: Lattice) -> tuple[np.ndarray, ...]:
+    """Return positions, roots of volumes, factors of m and of r (r·m) in pair sums, and tensors of the coupling.
+
+    The unit of length is the largest radius. The shapes are [n, 3], [n], [n, n], [n, n] and [entries, 3, 3].
+    """
+    unit, n = float(lattice.radii.max()), len(lattice.volumes)
+    x, radii = (lattice.positions - lattice.positions.mean(axis=0)) / unit, lattice.radii / unit
+    root, tensors = np.sqrt(lattice.volumes / unit**3), full_tensors(coupling.tensor) * unit**3
+    isotropic, dipolar = np.empty((2, n, n))
+    step = max(1, _CHUNK // n)
+    for start in range(0, n, step):
+        rows = slice(start, start + step)
+        distances = np.linalg.norm(x[rows, None] - x, axis=2)
+        isotropic[rows], dipolar[rows] = radial_factors(distances, radii[rows, None], radii)
+    isotropic[np.arange(n), np.arange(n)], dipolar[np.arange(n), np.arange(n)] = -1.0 / radii**3, 0.0
+    return x, root, isotropic, dipolar, tensors
 
 
 def _is_connected(coupling: Coupling) -> bool:
