@@ -433,3 +433,32 @@ def test_cells_of_slender_bodies_are_nearly_cubic():
         _, middle, most = np.sort(body.pieces[0].sides)
         assert most <= lattice.LONGEST * middle
         assert len(body.volumes) <= lattice.AUTOMATIC_COUNT
+
+
+@pytest.mark.parametrize("name", ["box", "crossed"])
+def test_response_of_cells_is_the_same_directly_and_by_iteration(name, monkeypatch):
+    """The iteration's error is the square of its residual over the smallest eigenvalue, here about 0.1."""
+    bars = [lattice.box([0.03, 0.01, 0.01]), lattice.box([0.01, 0.03, 0.01])]
+    body = lattice.fill({"box": bars[:1], "crossed": bars}[name], 0.005, together=True)
+    cells = demagnetization.coupling(body, body.radii)
+    direct = uniform_response.cell_polarizability(cells, body)
+    monkeypatch.setattr(uniform_response, "_MATRIX_CELLS", 0)
+    monkeypatch.setattr(uniform_response, "_RESIDUAL", 1e-6)
+    iterated = uniform_response.cell_polarizability(cells, body)
+    assert len(direct) == uniform_response.FIELD_COUNT
+    np.testing.assert_allclose(iterated, direct, atol=1e-10 * np.abs(direct).max())
+
+
+def test_repeated_cells_of_a_wire_are_evaluated_once(monkeypatch):
+    """Cells along a wire of aspect ratio 10,000 are equal, so their tensors depend on the distance only."""
+    body = lattice.fill(lattice.cylinder(1e-4, 1.0), across=lattice.LEAST_ACROSS, together=True)
+    evaluated, cut_tensors = [], demagnetization._cut_tensors
+
+    def counted(sides, filled, p, q, separation):
+        evaluated.append(len(p))
+        return cut_tensors(sides, filled, p, q, separation)
+
+    monkeypatch.setattr(demagnetization, "_cut_tensors", counted)
+    cells = demagnetization.coupling(body, body.radii)
+    assert len(cells.other) > 5 * len(body.volumes)
+    assert sum(evaluated) < 0.1 * len(body.volumes)
