@@ -370,7 +370,7 @@ def test_shapes_that_differ_by_a_ten_thousandth_are_different(difference):
         else:
             size = {"stretch": 1.0, "shift": 0.05}[difference]
             body = nail(builder, 0.0, **{difference: step * size + (difference == "stretch")})
-        warpmag.add_inducible(builder, body)
+        warpmag.add_inducible(builder, body=body)
     kinds = ShapeSampler(builder.finalize(device="cpu")).kinds
     kinds = kinds.reshape(30, -1)
     assert (kinds[0] != kinds[29]).any()
