@@ -341,7 +341,7 @@ def nail(builder, lean, stretch=1.0, shift=0.0):
 def test_shapes_equal_up_to_rounding_are_sampled_once(monkeypatch):
     builder = new_builder()
     for lean in np.linspace(0.0, 3.0, 40):
-        warpmag.add_inducible(builder, nail(builder, float(lean)))
+        warpmag.add_inducible(builder, body=nail(builder, float(lean)))
     model = builder.finalize(device="cpu")
     assert len(np.unique(model.shape_transform.numpy(), axis=0)) > 20
     sampled, sample = [], ShapeSampler._sample
