@@ -379,9 +379,9 @@ def test_sound_declarations_reach_newton(device, tmp_path, capfd):
 
 def test_what_newton_takes_as_declared():
     """Equal for the newest Newton; earlier ones lack some frequencies."""
-    assert {one.name.lower() for one in newton.Model.AttributeAssignment} == set(_DECLARED["assignment"])
+    assert {entry.name.lower() for entry in newton.Model.AttributeAssignment} == set(_DECLARED["assignment"])
     contacts = {"contact", "contact_rigid", "contact_soft"}  # which a builder refuses
-    frequencies, known = {one.name.lower() for one in newton.Model.AttributeFrequency}, set(_DECLARED["frequency"])
+    frequencies, known = {entry.name.lower() for entry in newton.Model.AttributeFrequency}, set(_DECLARED["frequency"])
     newest = hasattr(newton.Model.AttributeFrequency, "TENDON_GUIDE")
     assert frequencies - contacts == known if newest else frequencies - contacts < known
 
