@@ -32,23 +32,9 @@ template <class Arrays> CUDA_CALLABLE inline Ball ball_at(const Arrays& arrays, 
     return ball;
 }
 
-// Weight of a source's field at a ball, and its gradient by the ball's position. The weight fades from 1 to 0 with the
-// ball's distance from the box around the source. ``offset`` is the vector from the box to the ball.
-struct SourceFade {
-    Real weight;
-    Real3 slope, offset;
-};
-CUDA_CALLABLE inline SourceFade fade_of(const Ball& ball, const Frame& frame, Real3 center, Real3 half) {
-    auto excess = [](Real at, Real half) { return at > half ? at - half : at < -half ? at + half : Real(0); };
-    const Real3 r = ball.center - frame.origin;
-    const Real3 at = frame.to_body(r) - center;
-    const Real3 d = {excess(at.x, half.x), excess(at.y, half.y), excess(at.z, half.z)};
-    const Real3 offset = d.x * frame.x + d.y * frame.y + d.z * frame.z;
-    const Real distance = wp::sqrt(dot(d, d)) / ball.radius, width = MAGNET_REACH_HIGH - MAGNET_REACH_LOW;
-    const Real ramp = (MAGNET_REACH_HIGH - distance) / width, t = ramp < 1 ? ramp : Real(1);
-    if (!(t > 0)) return {0, {0, 0, 0}, offset};
-    const Real slope = t < 1 ? -6 * t * (1 - t) / (width * ball.radius * ball.radius * distance) : Real(0);
-    return {t * t * (3 - 2 * t), slope * offset, offset};
+// Weight of the field of a source in a box at a ball; its unit is the ball's radius.
+CUDA_CALLABLE inline SourceFade ball_fade(const Ball& ball, const Frame& frame, Real3 center, Real3 half) {
+    return fade_of(ball.center, ball.radius, MAGNET_REACH_LOW, MAGNET_REACH_HIGH, frame, center, half);
 }
 // Adds w H, and its derivatives w ∂H + ∂w H.
 CUDA_CALLABLE inline void add_faded(TargetField& to, const SourceFade& fade, const TargetField& s) {
@@ -65,7 +51,7 @@ template <class Arrays> CUDA_CALLABLE inline void add_coil(const Arrays& arrays,
     if (arrays.coils.label.data[s] == ball.label) return;
     const Real* const extent = arrays.coils.extent.data + 6 * (size_t)s;
     const Frame frame = frame_of((const Real*)arrays.coils.frame.data + 7 * (size_t)s);
-    const SourceFade fade = fade_of(ball, frame, real3(extent), real3(extent + 3));
+    const SourceFade fade = ball_fade(ball, frame, real3(extent), real3(extent + 3));
     if (fade.weight == 0) return;
     ball.in_field = true;
     for (int v = 0; v < VECTORS_PER_THREAD && Ball::first(v) < CHUNK; ++v) {
@@ -84,7 +70,7 @@ template <class Arrays> CUDA_CALLABLE inline void add_coil(const Arrays& arrays,
 template <class Arrays>
 CUDA_CALLABLE inline void add_body(const Arrays& arrays, const PermanentBody& body, Ball& ball) {
     if (body.responds) return; // its moments are neighbors of the ball already
-    const SourceFade fade = fade_of(ball, body.frame, body.box_center, body.box_half);
+    const SourceFade fade = ball_fade(ball, body.frame, body.box_center, body.box_half);
     if (fade.weight == 0 || body.label == ball.label) return;
     ball.in_field = true;
     const bool near = dot(fade.offset, fade.offset) < body.reach * body.reach;

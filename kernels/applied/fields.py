@@ -17,7 +17,7 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.applied import expansion
+from warpmag.kernels.applied import expansion, near_cells
 from warpmag.kernels.applied.sources import FieldSources, SourceKind, source_arrays_type
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.wrench import MU0
@@ -25,21 +25,23 @@ from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
-AT_TARGETS, AT_POINTS, AT_BALLS, REACT, ADD_UP = range(5)  # passes; as in ``passes.h``
-_TARGETS_PER_THREAD, _BALLS_PER_THREAD = 500, 50
-"""Fewest pairs of a source and a target, and fewest pairs of a source and a ball, per thread of a CPU."""
-_TARGETS_PER_ROW, _BALLS_PER_ROW, _MOST_ROWS = 256, 8, 64
-"""Fewest targets and fewest balls in a row of a reaction, and most rows of a source."""
+AT_TARGETS, AT_POINTS, AT_CELLS, AT_BALLS, ON_CELLS, REACT, ADD_UP = range(7)  # passes; as in ``passes.h``
+OF_TARGETS, OF_BALLS, OF_CELLS = range(3)  # kinds of rows; as in ``passes.h``
+_TARGETS_PER_THREAD, _BALLS_PER_THREAD, _CELLS_PER_THREAD = 500, 50, 50
+"""Fewest pairs of a source and a target, of a source and a ball, and fewest cells, per thread of a CPU."""
+_PER_ROW, _MOST_ROWS = {OF_TARGETS: 256, OF_BALLS: 8, OF_CELLS: 8}, 64
+"""Fewest targets, balls and cells in a row of a reaction, and most rows of a source."""
 _GROUP = 32  # threads of a GPU that share a source, or a row of its reaction
 
 
 @cache
-def _kernel(dtype, only_pass: int, group: int, coils: bool, solids: bool, rates: bool, balls: tuple):
+def _kernel(dtype, only_pass: int, group: int, coils: bool, solids: bool, cells: bool, rates: bool, balls: tuple):
     """Return the kernel of one pass, or of all passes if ``only_pass`` is −1."""
     call = "apply_sources(thread, first, last, threads, team.data, arrays)"
     arguments = {**PASS_ARGUMENTS, "arrays": source_arrays_type(dtype)}
     constants = {"MU0": MU0, "INVERSE_4PI": INVERSE_4PI, "COILS": int(coils), "SOLIDS": int(solids)}
-    constants |= {"PASS": only_pass, "GROUP": group, "RATES": int(rates)}
+    constants |= {"PASS": only_pass, "GROUP": group, "RATES": int(rates), "CELLS": int(cells)}
+    constants |= dict(zip(("CELL_REACH_LOW", "CELL_REACH_HIGH"), near_cells.CELL_REACH, strict=True))
     constants |= {kind.name: kind.value for kind in SourceKind}
     constants |= dict(zip(("BALLS", "MAGNET_REACH_LOW", "MAGNET_REACH_HIGH", "RESPONSE_ROWS"), balls, strict=True))
     return native_kernel(call, "applied/passes.h", arguments, dtype=dtype, **constants)
@@ -62,6 +64,8 @@ class AppliedField:
 
     balls: tuple = (0, 0.0, 0.0, 0)
     """Constants of ``balls.h``: 1 if fields are expanded about balls, range of fading, rows of the response."""
+    cell_count = 0
+    """Cells whose fields are averaged near permanent bodies."""
     rates: wp.array | None = None
     """Rate of the field of other bodies' sources [A/(m·s)], shape [t]; None before :meth:`enable_rates`."""
 
@@ -102,8 +106,8 @@ class AppliedField:
         cuda, key = self.device.is_cuda, (first, last)
         if items and key not in self._commands:
             sources, pass_and_group = self.sources, (first, group) if cuda else (-1, 1)
-            has_coils, has_solids = bool(sources.applied), bool(sources.solids)
-            kernel = _kernel(sources.dtype, *pass_and_group, has_coils, has_solids, bool(self.rates), self.balls)
+            switches = bool(sources.applied), bool(sources.solids), self.cell_count > 0, bool(self.rates)
+            kernel = _kernel(sources.dtype, *pass_and_group, *switches, self.balls)
             sizes = dict(threads=threads_for(items, share), gpu_threads=group * items)
             self._commands[key] = launch_passes(
                 kernel, first, last + 1, self.arrays, device=self.device, record_cmd=True, **sizes
@@ -117,6 +121,7 @@ class AppliedField:
         share = _TARGETS_PER_THREAD // max(1, int(np.diff(self.sources.lists).max(initial=0)))
         evaluation = AT_POINTS if self._points else AT_TARGETS
         self.run_passes(evaluation, evaluation, CHUNK * self.arrays.targets.chunk.shape[0], group, max(share, 1))
+        self.run_passes(AT_CELLS, AT_CELLS, self.cell_count, _GROUP, _CELLS_PER_THREAD)
 
     def add_to_probe(self, b, gradients):
         """Add μ0 M to the flux density [T] at points inside bodies, and the sources' gradients [A/m²] unless None."""
@@ -207,7 +212,25 @@ class AppliedForces(AppliedField):
         self._moves = bool(np.any(movable))
         self._fine_tables: dict[str, wp.array] | None = None
         self._movable, self._source = self._integers(np.asarray(movable, bool)), self._integers(source_of_moment)
-        self._lay_out_rows(np.asarray(worlds), np.asarray(worlds)[ball_indices])
+        self._worlds, self._ball_worlds = np.asarray(worlds), np.asarray(worlds)[ball_indices]
+        self._lay_out_rows(np.zeros(0, int))
+
+    def include_cells(self, bodies, rotations, forces, torques):
+        """Average the fields of permanent bodies over cells near them from now on.
+
+        Args:
+            bodies: The bodies of cells (``near_cells.NearCellBody``), in the order of ``rotations``; None for a body
+                that takes no part.
+            rotations: Rotation from each body's frame to the world, Warp array, shape [bodies].
+            forces, torques: Forces [N] and torques [N·m] to add to, Warp arrays, shape [n].
+        """
+        sources, cells = self.sources, self.arrays.cells
+        ranges, movable = sources.bodies_of(self._worlds), self._movable.numpy()
+        near_cells.lay_out(cells, bodies, rotations, ranges, movable, sources.dtype, self.device)
+        cells.forces, cells.torques = forces, torques
+        self.cell_count = cells.cell.shape[0]
+        self._lay_out_rows(self._worlds[cells.cell.numpy()[:, 0]])
+        self._commands.clear()
 
     def _lay_out_balls(self, ball_indices, worlds):
         sources, balls = self.sources, self.arrays.balls
@@ -220,15 +243,18 @@ class AppliedForces(AppliedField):
         shape = -(-self.count // CHUNK), expansion.EXPANSION_ROWS, CHUNK
         self.expansion = balls.expansion = wp.zeros(shape, dtype=sources.dtype, device=self.device)
 
-    def _lay_out_rows(self, worlds, ball_worlds):
-        """List the rows of each reaction that is computed: ranges of targets and of balls."""
+    def _lay_out_rows(self, cell_worlds):
+        """List the rows of each reaction that is computed: ranges of targets, of balls and of cells."""
         sources, rows, begin = self.sources, [], [0]
+        item_worlds = {OF_TARGETS: self._worlds, OF_BALLS: self._ball_worlds, OF_CELLS: cell_worlds}
         movable = [source.movable for source in sources.applied] + [solid.movable for solid in sources.solids]
         for s, source in enumerate((*sources.applied, *sources.solids)):
-            for least, item_worlds, is_ball in ((_TARGETS_PER_ROW, worlds, 0), (_BALLS_PER_ROW, ball_worlds, 1)):
-                first, end = np.searchsorted(item_worlds, [source.world, source.world + 1])
-                step = max(least, -(-(end - first) // _MOST_ROWS))
-                rows += [(s, k, min(k + step, end), is_ball) for k in range(first, end, step) if movable[s]]
+            for kind, worlds in item_worlds.items():
+                if not movable[s] or (kind == OF_CELLS and s < len(sources.applied)):
+                    continue
+                first, end = np.searchsorted(worlds, [source.world, source.world + 1])
+                step = max(_PER_ROW[kind], -(-(end - first) // _MOST_ROWS))
+                rows += [(s, k, min(k + step, end), kind) for k in range(first, end, step)]
             begin.append(len(rows))
         arrays, dtype, device = self.arrays, sources.dtype, self.device
         arrays.row = self._integers(np.array(rows, int).reshape(-1, 4), wp.vec4i)
@@ -273,11 +299,12 @@ class AppliedForces(AppliedField):
         """
         if self.arrays.effective is None or self.arrays.effective.ptr != effective.ptr:
             self.arrays.effective, self.arrays.balls.response = effective, response
-            self._commands = {key: command for key, command in self._commands.items() if key[1] < REACT}
+            self._commands = {key: command for key, command in self._commands.items() if key[1] < ON_CELLS}
         if self._adds:
             self._add_up(REACT if self._reacts else ADD_UP)
         if not self._moves:
             return
+        self.run_passes(ON_CELLS, ON_CELLS, self.cell_count, _GROUP, _CELLS_PER_THREAD)
         inputs = [self._movable, self._source, effective, *self.along, self.wrenches]
         kernel = _force_kernel(self.sources.dtype)
         wp.launch(kernel, self.count, inputs=inputs, outputs=[forces, torques], device=self.device)

@@ -1,21 +1,23 @@
-// Passes over targets and sources: fields at targets, fields about balls, and the reactions on sources.
+// Passes over targets and sources: fields at targets, over cells and about balls, and the reactions on sources.
 //
 // Fields and forces of a permanent body are corrections, its closed form less its lattice: the sums over pairs contain
 // the lattice already. On a CPU a pass works on a vector of targets or points. On a GPU a group of threads shares a
 // target, a ball, a row of targets, or a body.
 //
-// Takes GROUP, MU0 and INVERSE_4PI from Python, and the switches COILS, SOLIDS, BALLS and RATES. On a GPU a kernel runs
+// Takes GROUP, MU0 and INVERSE_4PI from Python, and the switches COILS, SOLIDS, CELLS, BALLS and RATES. On a GPU a kernel runs
 // the one pass PASS; on a CPU PASS is −1 and a kernel runs several. ``Arrays`` is the struct of sources.py.
 #pragma once
 #include "applied/balls.h"
 #include "applied/body_pairs.h"
+#include "applied/near_cells.h"
 #include "applied/rates.h"
 #include "shared/team.h"
 
 namespace warpmag {
 
-enum SourcePass { AT_TARGETS, AT_POINTS, AT_BALLS, REACT, ADD_UP }; // as in fields.py
-constexpr int WRENCH_ROW = 7;                                       // force, torque, energy
+enum SourcePass { AT_TARGETS, AT_POINTS, AT_CELLS, AT_BALLS, ON_CELLS, REACT, ADD_UP }; // as in fields.py
+enum RowKind { OF_TARGETS, OF_BALLS, OF_CELLS };                                         // as in fields.py
+constexpr int WRENCH_ROW = 7; // force, torque, energy
 
 // Targets from column i on: positions, radii, labels, and whether closed forms correct their fields.
 struct Targets {
@@ -139,15 +141,17 @@ CUDA_CALLABLE inline Wrench wrench_on_targets(const Arrays& arrays, int s, const
     }
     return wrench;
 }
-// Writes the reaction of a row of targets, or balls, on its source.
+// Writes the reaction of a row of targets, balls or cells on its source.
 template <class Arrays> CUDA_CALLABLE inline void react(const Arrays& arrays, int row) {
-    const auto& range = arrays.row.data[row]; // source, range of targets or balls, 1 for balls
+    const auto& range = arrays.row.data[row]; // source, range of targets, balls or cells, which of these
     const int s = range[0], coils = arrays.coils.kind.shape[0];
     const PermanentBody body = SOLIDS && s >= coils ? body_at(arrays, s - coils) : PermanentBody{};
     Real3 force = {0, 0, 0}, torque = force;
-    if (!range[3]) {
+    if (range[3] == OF_TARGETS) {
         const Wrench wrench = wrench_on_targets(arrays, s, body, range[1], range[2]);
         force = total_of(wrench.force), torque = total_of(wrench.torque);
+    } else if (CELLS && range[3] == OF_CELLS) {
+        if constexpr (CELLS) wrench_on_cells(arrays, body, range[1], range[2], force, torque);
     } else if constexpr (BALLS) {
         const Real3 center =
             s < coils ? real3((const Real*)arrays.coils.frame.data + 7 * (size_t)s) : reference_point(arrays, body);
@@ -217,8 +221,12 @@ CUDA_CALLABLE inline void apply_sources(int thread, int first, int last, int thr
             if (pass == AT_TARGETS) field_at_targets<false>(arrays, i);
         if constexpr (PASS < 0 || PASS == AT_POINTS)
             if (pass == AT_POINTS) field_at_targets<true>(arrays, i);
+        if constexpr (CELLS && (PASS < 0 || PASS == AT_CELLS))
+            if (pass == AT_CELLS) average_over_cell(arrays, i);
         if constexpr (BALLS && (PASS < 0 || PASS == AT_BALLS))
             if (pass == AT_BALLS) expand(arrays, i);
+        if constexpr (CELLS && (PASS < 0 || PASS == ON_CELLS))
+            if (pass == ON_CELLS) act_on_cell(arrays, i);
         if constexpr (PASS < 0 || PASS == REACT)
             if (pass == REACT) react(arrays, i);
         if constexpr (PASS < 0 || PASS == ADD_UP)
@@ -228,12 +236,16 @@ CUDA_CALLABLE inline void apply_sources(int thread, int first, int last, int thr
     run_item(PASS, thread / GROUP);
 #else
     auto item_count = [&](int pass) {
-        return pass < AT_BALLS    ? CHUNK * arrays.targets.chunk.shape[0]
-               : pass == AT_BALLS ? arrays.balls.ball.shape[0]
-               : pass == REACT    ? arrays.row.shape[0]
-                                  : arrays.wrench.shape[0];
+        switch (pass) {
+        case AT_BALLS: return arrays.balls.ball.shape[0];
+        case AT_CELLS:
+        case ON_CELLS: return arrays.cells.cell.shape[0];
+        case REACT: return arrays.row.shape[0];
+        case ADD_UP: return arrays.wrench.shape[0];
+        default: return CHUNK * arrays.targets.chunk.shape[0];
+        }
     };
-    run_passes(team, threads, first, last, item_count, first < AT_BALLS ? WIDTH : 1, run_item);
+    run_passes(team, threads, first, last, item_count, first <= AT_POINTS ? WIDTH : 1, run_item);
 #endif
 }
 }

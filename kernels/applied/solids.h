@@ -38,6 +38,26 @@ CUDA_CALLABLE inline Frame frame_of(const Real* at) {
             {n * (x * z + w * y), n * (y * z - w * x), 1 - n * (x * x + y * y)}};
 }
 
+// Weight of a source's field at a point, and its gradient by the point's position. ``offset`` is the vector from the box
+// around the source to the point.
+struct SourceFade {
+    Real weight;
+    Real3 slope, offset;
+};
+// The weight fades from 1 to 0 between the distances ``low`` and ``high`` from the box, in multiples of ``unit``.
+CUDA_CALLABLE inline SourceFade fade_of(Real3 point, Real unit, Real low, Real high, const Frame& frame, Real3 center,
+                                        Real3 half) {
+    auto excess = [](Real at, Real half) { return at > half ? at - half : at < -half ? at + half : Real(0); };
+    const Real3 at = frame.to_body(point - frame.origin) - center;
+    const Real3 d = {excess(at.x, half.x), excess(at.y, half.y), excess(at.z, half.z)};
+    const Real3 offset = d.x * frame.x + d.y * frame.y + d.z * frame.z;
+    const Real distance = wp::sqrt(dot(d, d)) / unit, width = high - low;
+    const Real ramp = (high - distance) / width, t = ramp < 1 ? ramp : Real(1);
+    if (!(t > 0)) return {0, {0, 0, 0}, offset};
+    const Real slope = t < 1 ? -6 * t * (1 - t) / (width * unit * unit * distance) : Real(0);
+    return {t * t * (3 - 2 * t), slope * offset, offset};
+}
+
 // A permanent body. Its closed form has the magnetization ``m`` in the body's frame, and ``m_world`` in the world. If
 // the body responds to fields, this is the magnetization of a ball by the remanence alone, without the part that fields
 // induce.

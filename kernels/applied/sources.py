@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from warpmag.kernels.applied.near_cells import cell_arrays_type
 from warpmag.kernels.applied.solids import INTEGER_TABLES, tables_of
 
 PARAMETERS = 9  # largest number of parameters of a source, in addition to its table
@@ -130,8 +131,8 @@ def target_arrays_type(dtype):
 @cache
 def source_arrays_type(dtype):
     """Return the struct of all sources and targets of a launch."""
-    coil_arrays, solid_arrays, target_arrays = (
-        make(dtype) for make in (coil_arrays_type, solid_arrays_type, target_arrays_type)
+    coil_arrays, solid_arrays, target_arrays, cell_arrays = (
+        make(dtype) for make in (coil_arrays_type, solid_arrays_type, target_arrays_type, cell_arrays_type)
     )
 
     @wp.struct
@@ -149,13 +150,14 @@ def source_arrays_type(dtype):
         coils: coil_arrays
         solids: solid_arrays
         targets: target_arrays
+        cells: cell_arrays
         balls: BallArrays
         # All moments:
         packed: wp.array2d[dtype]  # shape [8, n]
         effective: wp.array2d[dtype]  # effective moments of the force, shape [3, n]
         motion: wp.array2d[dtype]  # ``eddy.eddy`` describes its rows, shape [8, n]
         # Reactions on sources:
-        row: wp.array[wp.vec4i]  # source, range of targets or balls, 1 for balls
+        row: wp.array[wp.vec4i]  # source, range of targets, balls or cells, which of these (``fields``)
         row_begin: wp.array[int]  # first row of each source
         partial: wp.array2d[dtype]  # force and torque of each row, shape [rows, 6]
         wrench: wp.array2d[dtype]  # force, torque and half the energy of each source, shape [sources, 7]

@@ -59,10 +59,13 @@ class Coupling:
     start: np.ndarray  # first entry of each moment, and the end, shape [n + 1]
     other: np.ndarray  # moment j of each entry, ascending, shape [entries]
     tensor: np.ndarray  # T_ij [1/m³], xx, yy, zz, xy, xz, yz, shape [entries, 6]
+    tensor_among_others: np.ndarray  # T_ij if the world has another body of cells, shape [entries, 6]
     common: np.ndarray  # matrix C [1/m³], shape [8, 8]
     positions: np.ndarray  # positions of the moments [m], shape [n, 3]
     radii: np.ndarray  # radii of the moments' balls [m], shape [n]
     half_sides: np.ndarray  # boxes with the volumes and second moments of the cells, frame of the grid [m], [n, 3]
+    outer_faces: np.ndarray  # True for the faces −x, +x, −y, ... of whole cells on the body's surface, shape [n, 6]
+    cell_sides: np.ndarray  # sides of a whole cell [m], frame of the grid, shape [3]
     grid_rotation: np.ndarray  # from the frame of the grid to that of the body (x, y, z, w), shape [4]
 
     @cached_property
@@ -81,9 +84,9 @@ class Coupling:
         return (self.positions - self.center) / self.extent
 
     @cached_property
-    def without_common_fields(self) -> "Coupling":
-        """The coupling without the correction of the common fields, one object for all bodies of the shape."""
-        return replace(self, common=np.zeros_like(self.common))
+    def among_others(self) -> "Coupling":
+        """The coupling in a world with another body of cells, without common fields; shared by bodies of the shape."""
+        return replace(self, tensor=self.tensor_among_others, common=np.zeros_like(self.common))
 
     @cached_property
     def dense(self) -> np.ndarray:
@@ -170,18 +173,34 @@ def coupling(lattice: Lattice, radii: np.ndarray) -> Coupling:
     (i, j), tensor = np.concatenate(entries, axis=1), np.concatenate(tensors)
     order = np.lexsort((j, i))
     start = np.searchsorted(i[order], np.arange(len(volumes) + 1))
-    boxes, grid_rotation = _boxes(lattice)
-    return Coupling(start, j[order], tensor[order], np.zeros((8, 8)), x, radii, boxes, grid_rotation)
-
-
-def _boxes(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
-    """Return the half sides of the cells' boxes [m], shape [n, 3], and the rotation of their grid (x, y, z, w)."""
     (part,) = lattice.pieces  # the shapes of an inducible body share a grid
-    volumes = np.bincount(part.moment, part.share * part.filled.mean(axis=(1, 2, 3))[part.piece])
-    squares = np.einsum("nkk->nk", _spreads(part, 0, volumes))
+    return Coupling(
+        start, j[order], tensor[order], tensor[order], np.zeros((8, 8)), x, radii, _boxes(part, lattice.volumes),
+        _outer_faces(part, len(volumes)), part.sides, quaternion_of(part.rotation),
+    )  # fmt: skip
+
+
+def _boxes(part: Pieces, volumes: np.ndarray) -> np.ndarray:
+    """Return the half sides of the cells' boxes [m], shape [n, 3]."""
+    filled = np.bincount(part.moment, part.share * part.filled.mean(axis=(1, 2, 3))[part.piece])
+    squares = np.einsum("nkk->nk", _spreads(part, 0, filled))
     half = np.sqrt(3.0 * squares)
-    half *= np.cbrt(lattice.volumes / (8.0 * half.prod(axis=1)))[:, None]
-    return half, quaternion_of(part.rotation)
+    return half * np.cbrt(volumes / (8.0 * half.prod(axis=1)))[:, None]
+
+
+def _outer_faces(part: Pieces, count: int) -> np.ndarray:
+    """Return True for each face of a whole cell beyond which no cell follows, shape [count, 6]."""
+    whole = (part.filled.min(axis=(1, 2, 3)) == 1.0) & (np.bincount(part.piece) == 1)
+    alone = whole[part.piece] & (np.bincount(part.moment, minlength=count) == 1)[part.moment]
+    index = part.index - part.index.min(axis=0) + 1
+    occupied = np.zeros(index.max(axis=0) + 2, bool)
+    occupied[tuple(index.T)] = True
+    outer = np.zeros((count, 6), bool)
+    for face in range(6):
+        beyond = index[part.piece[alone]]
+        beyond[:, face // 2] += 2 * (face % 2) - 1
+        outer[part.moment[alone], face] = ~occupied[tuple(beyond.T)]
+    return outer
 
 
 def _pair_law(r, a, b, same):
@@ -218,7 +237,7 @@ def _part_tensors(part: Pieces, lattice: Lattice) -> tuple[np.ndarray, np.ndarra
     sums[own] += _far_corrections(local, part.sides.prod() * volume, spreads, reach)[i[own]]
     distinct = i != j
     pairs = np.concatenate([np.stack([i, j]), np.stack([j[distinct], i[distinct]])], axis=1) + first
-    return pairs, _rotated(np.concatenate([sums, sums[distinct]]), part.rotation)
+    return pairs, rotated(np.concatenate([sums, sums[distinct]]), part.rotation)
 
 
 def _second_moments(part: Pieces, first: int, volume: np.ndarray) -> np.ndarray:
@@ -392,6 +411,6 @@ def full_tensors(six: np.ndarray) -> np.ndarray:
     return full
 
 
-def _rotated(six: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+def rotated(six: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Return the six components of rotated symmetric tensors."""
     return (rotation @ full_tensors(six) @ rotation.T)[:, *COMPONENTS]

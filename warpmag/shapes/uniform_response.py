@@ -30,7 +30,7 @@ from warpmag.shapes.solids import Solid
 
 FIELD_COUNT = 8
 """Largest number of fields that the cells of a body have in common: three uniform and five linear fields."""
-_LINEAR_FIELD_CELLS = 65, 2500
+LINEAR_FIELD_CELLS = 65, 2500
 """Smallest and largest number of cells of bodies that get the linear fields, too. Bodies of fewer cells may respond
 collectively (``kernels.induction.body_response``), which needs symmetric tensors; with linear fields they are not
 symmetric. Bodies of more cells need little correction, and its time is proportional to their number."""
@@ -119,7 +119,7 @@ def surface_polarizability(coupling: Coupling, surface: np.ndarray) -> np.ndarra
 
 def _field_count(coupling: Coupling) -> int:
     """Return the number of common fields for the cells of a body."""
-    return FIELD_COUNT if _LINEAR_FIELD_CELLS[0] <= len(coupling.radii) <= _LINEAR_FIELD_CELLS[1] else 3
+    return FIELD_COUNT if LINEAR_FIELD_CELLS[0] <= len(coupling.radii) <= LINEAR_FIELD_CELLS[1] else 3
 
 
 def potentials(points: np.ndarray, surface: np.ndarray) -> np.ndarray:
@@ -217,8 +217,8 @@ def _cell_operator(coupling: Coupling, lattice: Lattice):
 
     With r = x − y, each term of r(r·m) becomes a sum over y, computed as a product of matrices.
     """
-    x, root, isotropic, dipolar, tensors = _pair_factors(coupling, lattice)
-    n = len(x)
+    x, root, isotropic, dipolar, unit = pair_factors(coupling, lattice)
+    n, tensors = len(x), full_tensors(coupling.tensor) * unit**3
 
     def apply(scaled: np.ndarray) -> np.ndarray:
         m = scaled * root[:, None, None]
@@ -238,8 +238,8 @@ def _cell_operator(coupling: Coupling, lattice: Lattice):
 
 def _cell_matrix(coupling: Coupling, lattice: Lattice) -> np.ndarray:
     """Return the operator of :func:`_cell_operator` as a matrix, shape [3 n, 3 n]."""
-    x, root, isotropic, dipolar, tensors = _pair_factors(coupling, lattice)
-    n = len(x)
+    x, root, isotropic, dipolar, unit = pair_factors(coupling, lattice)
+    n, tensors = len(x), full_tensors(coupling.tensor) * unit**3
     matrix = np.empty((n, 3, n, 3))
     for k, j in zip(*COMPONENTS, strict=True):
         block = dipolar * (x[:, None, k] - x[:, k]) * (x[:, None, j] - x[:, j]) + (isotropic if k == j else 0.0)
@@ -249,14 +249,14 @@ def _cell_matrix(coupling: Coupling, lattice: Lattice) -> np.ndarray:
     return matrix.reshape(3 * n, 3 * n)
 
 
-def _pair_factors(coupling: Coupling, lattice: Lattice) -> tuple[np.ndarray, ...]:
-    """Return positions, roots of volumes, factors of m and of r (r·m) in pair sums, and tensors of the coupling.
+def pair_factors(coupling: Coupling, lattice: Lattice) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return positions, roots of volumes, factors of m and of r (r·m) in 4π times the pair sums, and the unit of length.
 
-    The unit of length is the largest radius. The shapes are [n, 3], [n], [n, n], [n, n] and [entries, 3, 3].
+    The unit is the largest radius [m]. The shapes are [n, 3], [n], [n, n] and [n, n].
     """
     unit, n = float(lattice.radii.max()), len(lattice.volumes)
     x, radii = (lattice.positions - lattice.positions.mean(axis=0)) / unit, lattice.radii / unit
-    root, tensors = np.sqrt(lattice.volumes / unit**3), full_tensors(coupling.tensor) * unit**3
+    root = np.sqrt(lattice.volumes / unit**3)
     isotropic, dipolar = np.empty((2, n, n))
     step = max(1, _CHUNK // n)
     for start in range(0, n, step):
@@ -264,7 +264,7 @@ def _pair_factors(coupling: Coupling, lattice: Lattice) -> tuple[np.ndarray, ...
         distances = np.linalg.norm(x[rows, None] - x, axis=2)
         isotropic[rows], dipolar[rows] = radial_factors(distances, radii[rows, None], radii)
     isotropic[np.arange(n), np.arange(n)], dipolar[np.arange(n), np.arange(n)] = -1.0 / radii**3, 0.0
-    return x, root, isotropic, dipolar, tensors
+    return x, root, isotropic, dipolar, unit
 
 
 def _is_connected(coupling: Coupling) -> bool:

@@ -16,6 +16,7 @@ from warpmag.shapes import lattice, polyhedra
 from warpmag.shapes.demagnetization import Coupling, coupling
 from warpmag.shapes.polyhedra import Polyhedron
 from warpmag.shapes.solids import boxes_meet
+from warpmag.shapes.softening import softened
 from warpmag.shapes.uniform_response import with_surface_response
 
 _REACH = 3.0
@@ -114,7 +115,7 @@ class ShapeSampler:
         )
         if fixed:
             return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solids=parts)
-        cells = with_surface_response(coupling(filled, filled.radii), filled, solids)
+        cells = with_surface_response(softened(coupling(filled, filled.radii), filled), filled, solids)
         return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells, parts)
 
     def _polyhedra(self, shapes: list[int], solids: list[lattice.Solid]) -> list[Polyhedron]:

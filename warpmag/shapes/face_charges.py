@@ -1,0 +1,50 @@
+"""Charges on a flat face of iron that vary over less than a cell, and their response to a potential.
+
+Cells are uniformly magnetized, and so are the charges of their faces. In front of the edge of a magnet the charge of an
+iron face varies over less than a cell. Without that a magnet in contact pulls 15 to 30 % too little.
+
+A face gets charges q on equal squares besides. Those of an ideally permeable body keep its surface at one potential:
+S q + φ = const with the potentials S of uniformly charged squares. As uniform and linear charges are left to the
+magnetization of the cells, q = −R φ with R = Q (Qᵀ S Q)⁻¹ Qᵀ, where the columns of Q span all other charges. The energy
+is −½ μ0 φᵀ R φ. A body of finite susceptibility χ responds by χ/(χ + 2) of that, as a half-space does. Charges of
+different faces do not act on each other: they fall off fast.
+"""
+
+import numpy as np
+
+from warpmag.shapes.uniform_response import potentials
+
+_GAUSS_POINTS = 3
+"""Points along each side of a square, over which its potential is averaged."""
+
+
+def face_response(sides: np.ndarray, split: int) -> np.ndarray:
+    """Return the responses R [m] of the faces of a cuboid across x, y and z, shape [3, split², split²].
+
+    ``sides`` are those of the cuboid [m], shape [3]. A face has ``split`` squares along each side; the last axis of the
+    cuboid comes last.
+
+    Example:
+        >>> face_response(np.array([0.004, 0.004, 0.002]), 4).shape
+        (3, 16, 16)
+    """
+    others = (1, 2), (0, 2), (0, 1)
+    return np.stack([_rectangle_response(sides[list(axes)], split) for axes in others])
+
+
+def _rectangle_response(sides: np.ndarray, split: int) -> np.ndarray:
+    """Return R [m] of a rectangle with ``sides`` [m], shape [2], on split × split rectangles."""
+    step = sides / split
+    middles = [(np.arange(split) + 0.5) / split - 0.5 for _ in range(2)]
+    unit = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1).reshape(-1, 2)
+    corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * step
+    squares = np.pad((unit * sides)[:, None] + corners, ((0, 0), (0, 0), (0, 1)))
+    nodes, weights = np.polynomial.legendre.leggauss(_GAUSS_POINTS)
+    inner = 0.5 * np.stack(np.meshgrid(nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 2) * step
+    points = np.pad(((unit * sides)[:, None] + inner).reshape(-1, 2), ((0, 0), (0, 1)))
+    at_points = potentials(points, squares).reshape(split**2, len(inner), -1) / step.prod()
+    self_potential = np.einsum("ipj,p->ij", at_points, 0.25 * np.outer(weights, weights).ravel())
+    self_potential = 0.5 * (self_potential + self_potential.T)
+    of_cells = np.column_stack([np.ones(len(unit)), unit])
+    other = np.linalg.svd(of_cells)[0][:, of_cells.shape[1] :]
+    return other @ np.linalg.solve(other.T @ self_potential @ other, other.T)
