@@ -174,10 +174,10 @@ def test_flat_cells_of_thin_plates_keep_the_operator_positive(monkeypatch):
 
 @pytest.mark.parametrize(("gap", "aside"), [(0.0005, 0.0), (0.0005, 0.01), (0.001, 0.0), (0.002, 0.0), (0.005, 0.01)])
 def test_a_plate_below_a_ferrite_cube_is_pulled_as_by_a_surface_integral_equation(device, gap, aside):
-    """5 % close up, 2 % from a cell's height on; the reference with 12 rectangles is good to 0.3 %."""
+    """5 % close up, 2.5 % from a cell's height on; the reference with 12 rectangles is good to 0.3 %."""
     pull, magnetized, _ = plate.model_forces(gap, aside, device)
     force, moment = plate.force(gap, aside, 12)
-    close = 0.02 if gap >= 0.002 else 0.05
+    close = 0.025 if gap >= 0.002 else 0.05
     assert np.linalg.norm(pull - force) < close * np.linalg.norm(force)
     assert np.linalg.norm(magnetized - moment) < 0.02 * np.linalg.norm(moment)
 

@@ -310,13 +310,20 @@ class AppliedForces(AppliedField):
         wp.launch(kernel, self.count, inputs=inputs, outputs=[forces, torques], device=self.device)
 
     def energies(self) -> np.ndarray:
-        """Return the energy of permanent bodies near each other less that of their moments [J], shape [n].
+        """Return the energy of permanent bodies near each other or near cells, less that of moments [J], shape [n].
 
         The energy of moments in fields follows from ``acting``. Waits for the device.
         """
-        energies, solids, arrays = np.zeros(self.count), self.sources.solids, self.arrays
-        if len(solids) < 2:
-            return energies
+        energies, arrays = np.zeros(self.count), self.arrays
+        if self.cell_count:
+            energies[arrays.cells.cell.numpy()[:, 0]] = MU0 * near_cells.energies(arrays.cells)
+        if len(self.sources.solids) > 1:
+            energies[[solid.first for solid in self.sources.solids]] = self._energies_between_bodies()
+        return energies
+
+    def _energies_between_bodies(self) -> np.ndarray:
+        """Return half the energy of each permanent body with those near it [J], from fine points, shape [bodies]."""
+        arrays = self.arrays
         self._fine_tables = self._fine_tables or self.sources.tables(fine=True)
         coarse = {name: getattr(self.sources.solid_arrays, name) for name in self._fine_tables}
         for tables in (self._fine_tables, coarse):
@@ -325,5 +332,4 @@ class AppliedForces(AppliedField):
             self._commands.pop((ADD_UP, ADD_UP), None)
             if tables is self._fine_tables:
                 self._add_up(ADD_UP)
-        energies[[solid.first for solid in solids]] = self.wrenches.numpy()[len(self.sources.applied) :, 6]
-        return energies
+        return self.wrenches.numpy()[len(self.sources.applied) :, 6]

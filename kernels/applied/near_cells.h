@@ -33,7 +33,7 @@ struct Cell {
     CUDA_CALLABLE bool is_outer(int face) const { return outer >> face & 1; }
 };
 template <class Arrays> CUDA_CALLABLE inline Cell cell_at(const Arrays& arrays, int c) {
-    const auto& row = arrays.cells.cell.data[c]; // moment, body of its rotation, range of permanent bodies
+    const auto& row = arrays.cells.cell.data[c];  // moment, body of its rotation, range of permanent bodies
     const auto& form = arrays.cells.form.data[c]; // bits of outer faces, index of its matrices
     const Real* const box = arrays.cells.box.data + 4 * (size_t)c; // half sides, χ/(χ + 2)
     const Real* const q = (const Real*)arrays.cells.rotation.data + 4 * (size_t)row[1];
@@ -69,8 +69,7 @@ CUDA_CALLABLE inline Real3 first_lane(Vector v) { return {lane_of(v.x, 0), lane_
 CUDA_CALLABLE inline TargetField center_field(const Cell& cell, const PermanentBody& body) {
     const Vector at = body.frame.point_to_body(broadcast(cell.center));
     const Number least2 = Number(Real(0)) + Real(0.25) * cell.radius * cell.radius;
-    const TargetField f =
-        target_field(body.frame.to_world(field_of(body.solid, body.m, at, least2, share(), SHARES)));
+    const TargetField f = target_field(body.frame.to_world(field_of(body.solid, body.m, at, least2, share(), SHARES)));
     return {group_sums(f.h), group_sums(f.x), group_sums(f.y), group_sums(f.z)};
 }
 

@@ -112,3 +112,15 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solid_rang
     arrays.movable = put(movable)
     arrays.near = wp.zeros(len(order), dtype=wp.int32, device=device)
     arrays.potential = wp.zeros(len(order) * 6 * FACE_POINTS, dtype=dtype, device=device)
+
+
+def energies(arrays) -> np.ndarray:
+    """Return the energies over μ0 of the charges on the faces of cells, −½ φᵀ R φ, shape [cells]."""
+    near = np.flatnonzero(arrays.near.numpy())
+    forms, factors = arrays.form.numpy()[near], arrays.box.numpy()[near, 3].astype(float)
+    potentials = arrays.potential.numpy().reshape(-1, 6, FACE_POINTS)[near].astype(float)
+    matrices = arrays.response.numpy().reshape(-1, 3, FACE_POINTS, FACE_POINTS)[forms[:, 1]].astype(float)
+    of_faces = np.einsum("cfi,cfij,cfj->cf", potentials, np.repeat(matrices, 2, axis=1), potentials)
+    result = np.zeros(len(arrays.near))
+    result[near] = -0.5 * factors * (of_faces * (forms[:, :1] >> np.arange(6) & 1)).sum(axis=1)
+    return result

@@ -4,8 +4,8 @@
 // the lattice already. On a CPU a pass works on a vector of targets or points. On a GPU a group of threads shares a
 // target, a ball, a row of targets, or a body.
 //
-// Takes GROUP, MU0 and INVERSE_4PI from Python, and the switches COILS, SOLIDS, CELLS, BALLS and RATES. On a GPU a kernel runs
-// the one pass PASS; on a CPU PASS is −1 and a kernel runs several. ``Arrays`` is the struct of sources.py.
+// Takes GROUP, MU0 and INVERSE_4PI from Python, and the switches COILS, SOLIDS, CELLS, BALLS and RATES. On a GPU a
+// kernel runs the one pass PASS; on a CPU PASS is −1 and a kernel runs several. ``Arrays`` is the struct of sources.py.
 #pragma once
 #include "applied/balls.h"
 #include "applied/body_pairs.h"
@@ -16,8 +16,8 @@
 namespace warpmag {
 
 enum SourcePass { AT_TARGETS, AT_POINTS, AT_CELLS, AT_BALLS, ON_CELLS, REACT, ADD_UP }; // as in fields.py
-enum RowKind { OF_TARGETS, OF_BALLS, OF_CELLS };                                         // as in fields.py
-constexpr int WRENCH_ROW = 7; // force, torque, energy
+enum RowKind { OF_TARGETS, OF_BALLS, OF_CELLS };                                        // as in fields.py
+constexpr int WRENCH_ROW = 7;                                                           // force, torque, energy
 
 // Targets from column i on: positions, radii, labels, and whether closed forms correct their fields.
 struct Targets {

@@ -38,8 +38,8 @@ CUDA_CALLABLE inline Frame frame_of(const Real* at) {
             {n * (x * z + w * y), n * (y * z - w * x), 1 - n * (x * x + y * y)}};
 }
 
-// Weight of a source's field at a point, and its gradient by the point's position. ``offset`` is the vector from the box
-// around the source to the point.
+// Weight of a source's field at a point, and its gradient by the point's position. ``offset`` is the vector from the
+// box around the source to the point.
 struct SourceFade {
     Real weight;
     Real3 slope, offset;

@@ -224,7 +224,8 @@ def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1,
     Args:
         solids: Shapes of one body, posed in its frame. Overlap belongs to the earlier shape.
         spacing: Distance between moments [m]; 0 chooses it for about, and at most, :data:`AUTOMATIC_COUNT` moments. A
-            shape smaller than the spacing gets one moment.
+            shape smaller than the spacing gets one moment. A smaller spacing than the automatic one leaves at least as
+            many cells across a shape.
         across: Smallest number of cells across a shape at automatic spacing, with flatter cells where necessary, up to
             :data:`FLATTEST`. Thinner shapes have fewer cells across.
         together: True if all shapes share one grid, in the frame of the largest, which tensors between them require. A
@@ -238,9 +239,11 @@ def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1,
     if spacing > 0.0:
         if not fits([p.upper - p.lower for p in parts], spacing):
             raise InputError(f"spacing: {spacing} m needs more than {LARGEST_COUNT} moments for one body")
-        return _fill(parts, spacing, 1, together)
     most = max(AUTOMATIC_COUNT, across**3 * len(parts))
-    spacing, across = _automatic_cells(parts, across, most, together)
+    automatic, across = _automatic_cells(parts, across, most, together)
+    if spacing > 0.0:
+        return _fill(parts, spacing, across if spacing < automatic else 1, together)
+    spacing = automatic
     lattice = _fill(parts, spacing, across, together)
     while len(lattice.volumes) > most:
         spacing *= _STEP

@@ -16,7 +16,7 @@ import numpy as np
 
 from warpmag.shapes.demagnetization import COMPONENTS, Coupling, rotated
 from warpmag.shapes.lattice import Lattice, Pieces
-from warpmag.shapes.uniform_response import LINEAR_FIELD_CELLS, pair_factors
+from warpmag.shapes.uniform_response import LINEAR_FIELD_CELLS, MOST_MOMENTS, pair_factors
 
 _SHARE = 0.5
 """Share of AᵀNA in the operator."""
@@ -41,11 +41,11 @@ class _Average:
 
 
 def softened(coupling: Coupling, lattice: Lattice) -> Coupling:
-    """Return the coupling of a lone body with the mean operator, for bodies of 65 to 2500 cells.
+    """Return the coupling of a lone body with the mean operator, for bodies of 65 to 6200 cells.
 
     The tensors of other pairs than those of the coupling's list are not changed.
     """
-    if not LINEAR_FIELD_CELLS[0] <= len(coupling.radii) <= LINEAR_FIELD_CELLS[1]:
+    if not LINEAR_FIELD_CELLS[0] <= len(coupling.radii) <= MOST_MOMENTS:
         return coupling
     (part,) = lattice.pieces  # the shapes of an inducible body share a grid
     x, root, isotropic, dipolar, unit = pair_factors(coupling, lattice)
@@ -87,10 +87,9 @@ def _averages(part: Pieces, count: int) -> list[_Average]:
 def _adjacent(index: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
     """Return all pairs of pieces whose cells follow each other along an axis."""
     index = index - index.min(axis=0)
-    shape = index.max(axis=0) + 2
-    cell, step = np.ravel_multi_index(tuple(index.T), shape), np.eye(3, dtype=int)[axis]
+    shape, step = index.max(axis=0) + 2, np.eye(3, dtype=int)[axis]
+    cell, beyond = (np.asarray(np.ravel_multi_index(tuple(at.T), shape)) for at in (index, index + step))
     order = np.argsort(cell, kind="stable")
-    beyond = np.ravel_multi_index(tuple((index + step).T), shape)
     first, last = (np.searchsorted(cell[order], beyond, side) for side in ("left", "right"))
     count = last - first
     p = np.repeat(np.arange(len(index)), count)

@@ -250,7 +250,7 @@ def _cell_matrix(coupling: Coupling, lattice: Lattice) -> np.ndarray:
 
 
 def pair_factors(coupling: Coupling, lattice: Lattice) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return positions, roots of volumes, factors of m and of r (r·m) in 4π times the pair sums, and the unit of length.
+    """Return positions, roots of volumes, factors of m and of r (r·m) in 4π times the pair sums, and a unit of length.
 
     The unit is the largest radius [m]. The shapes are [n, 3], [n], [n, n] and [n, n].
     """

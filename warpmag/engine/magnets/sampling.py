@@ -15,8 +15,8 @@ from warpmag.moments.arrays import RADIUS_RANGE
 from warpmag.shapes import lattice, polyhedra
 from warpmag.shapes.demagnetization import Coupling, coupling
 from warpmag.shapes.polyhedra import Polyhedron
-from warpmag.shapes.solids import boxes_meet
 from warpmag.shapes.softening import softened
+from warpmag.shapes.solids import boxes_meet
 from warpmag.shapes.uniform_response import with_surface_response
 
 _REACH = 3.0

@@ -1,0 +1,114 @@
+"""Permanent bodies near iron cells: average fields, charges on faces, the operator of a lone body.
+
+References: magpylib's closed form averaged over a cell, derivatives of the energy, finite elements, eigenvalues.
+"""
+
+from dataclasses import replace
+
+import magpylib
+import numpy as np
+import pytest
+
+from bench import iron
+from bench.reference.iron_bodies import SETUPS, Body, Setup, load
+from bench.reference.oracle import MU0
+from warpmag.shapes import demagnetization, lattice
+from warpmag.shapes.face_charges import face_response
+from warpmag.shapes.softening import softened
+from warpmag.shapes.uniform_response import _cell_matrix
+
+REMANENCE = 1.3  # T
+PLATE = Body("box", (0.03, 0.03, 0.0015), (0.0, 0.0, -0.0015))
+TURNED = replace(PLATE, turn=0.3, center=(0.0, 0.0, -0.0055))  # 0.9 mm below the edge of the magnet
+
+
+def with_magnet(plate: Body, shift, gap: float) -> Setup:
+    """Return a plate below a magnet of 20 × 5 mm with a shift [m] along x and y, and a gap [m] above z = 0."""
+    center = (*shift, gap + 0.0025)
+    return Setup((plate, Body("cylinder", (0.01, 0.0025), center, 0.0, magnetization=(0.0, 0.0, REMANENCE / MU0))))
+
+
+def test_field_of_a_near_magnet_is_its_average_over_a_cell(device):
+    """Midpoints of 4 × 4 squares integrate the potential of a face to about 2 %, at 1 mm from the magnet's edge."""
+    _, _, magnetics = iron.model_forces(with_magnet(PLATE, (0.0013, 0.0007), 1e-3), 0, device, "dipole")
+    system, magnet = magnetics.system, magpylib.magnet.Cylinder(
+        polarization=(0.0, 0.0, REMANENCE), dimension=(0.02, 0.005), position=(0.0013, 0.0007, 0.0035)
+    )  # fmt: skip
+    cells = system.source_interaction.arrays.cells
+    rows, boxes = cells.cell.numpy()[:, 0], cells.box.numpy()[:, :3].astype(float)
+    positions, field = system.positions.numpy().astype(float)[rows], system._induction.h0.numpy()[rows]
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    inner = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 3)
+    weights = np.einsum("i,j,k->ijk", weights, weights, weights).ravel() / 8.0
+    near = np.abs(positions[:, :2] - (0.0013, 0.0007)).max(axis=1) < 0.008
+    expected = np.array([
+        weights @ magnet.getH(x + inner * box) for x, box in zip(positions[near], boxes[near], strict=True)
+    ])  # fmt: skip
+    assert near.sum() > 20
+    np.testing.assert_allclose(field[near], expected, atol=0.02 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("plate", [PLATE, TURNED], ids=["flat", "turned"])
+@pytest.mark.parametrize("gap", [1e-4, 3.7e-3], ids=["close", "fading"])
+def test_force_is_the_derivative_of_the_energy(plate, gap, device):
+    """At 3.7 mm the averages fade. Rounding of the energy in float32 over steps of 0.02 mm is 1 % of the force."""
+    step = 2e-5
+    for axis in (0, 2):
+        energies = []
+        for sign in (-1.0, 1.0):
+            shift = np.array([0.0013, 0.0007, gap])
+            shift[axis] += sign * step
+            _, _, magnetics = iron.model_forces(with_magnet(plate, shift[:2], shift[2]), 0, device, "dipole")
+            energies.append(float(magnetics.energy()[0]))
+        forces, _, _ = iron.model_forces(with_magnet(plate, (0.0013, 0.0007), gap), 0, device, "dipole")
+        expected = -(energies[1] - energies[0]) / (2.0 * step)
+        assert abs(forces[1, axis] - expected) < 0.01 * np.linalg.norm(forces[1])
+        np.testing.assert_allclose(forces.sum(axis=0), 0.0, atol=2e-6 * np.abs(forces).max())
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.0013, 0.0021])
+def test_magnet_in_contact_pulls_right_wherever_the_cells_are(shift, device):
+    """The reference is by finite elements at the center of a plate of 80 mm; 2 mm beside it the force is the same.
+
+    The plate keeps its cells; their error is 3 %, that of a magnet's edge among 16 points of a face 4 %.
+    """
+    name = "magnet μ 1 over iron plate 3, gap 0.02"
+    setup, expected = SETUPS[name], load()[name]["forces"][1][2]
+    plate, magnet = setup.bodies
+    moved = replace(magnet, center=(shift, 0.5 * shift, magnet.center[2]))
+    forces, _, _ = iron.model_forces(replace(setup, bodies=(plate, moved)), 0, device, "dipole")
+    assert forces[1, 2] == pytest.approx(expected, rel=0.07)
+
+
+def test_charges_of_a_face_are_neither_uniform_nor_linear():
+    """Such charges belong to the cells. The response is symmetric, and the energy never positive."""
+    sides = np.array([0.004, 0.003, 0.002])
+    for response, (a, b) in zip(face_response(sides, 4), ((1, 2), (0, 2), (0, 1)), strict=True):
+        middles = (np.arange(4) + 0.5) / 4.0 - 0.5
+        u, v = (x.ravel() for x in np.meshgrid(middles * sides[a], middles * sides[b], indexing="ij"))
+        np.testing.assert_allclose(response, response.T, atol=1e-12)
+        assert np.abs(response @ np.column_stack([np.ones(16), u, v])).max() < 1e-12
+        assert np.linalg.eigvalsh(response).min() > -1e-12
+    assert np.abs(face_response(2.0 * sides, 4) - 2.0 * face_response(sides, 4)).max() < 1e-12  # a length
+
+
+@pytest.mark.parametrize("solid", [lattice.box([0.02, 0.02, 0.0015]), lattice.cylinder(0.01, 0.004)])
+def test_softer_cells_keep_the_energy_of_uniform_magnetization(solid):
+    """The operator stays positive, and its largest eigenvalue falls. Pairs beyond the list are left out: 3 %."""
+    body = lattice.fill(solid, 0.0, lattice.LEAST_ACROSS, together=True)
+    stiff = demagnetization.coupling(body, body.radii)
+    before, after = (_cell_matrix(coupling, body) for coupling in (stiff, softened(stiff, body)))
+    for axis in np.eye(3):
+        uniform = np.outer(np.sqrt(body.volumes), axis).ravel()
+        np.testing.assert_allclose(uniform @ after @ uniform, uniform @ before @ uniform, rtol=0.03)
+    eigenvalues = np.linalg.eigvalsh(after)
+    assert 0.0 < eigenvalues[0] and eigenvalues[-1] < np.linalg.eigvalsh(before)[-1]
+
+
+def test_a_smaller_spacing_leaves_no_fewer_layers():
+    plate = lattice.box([0.04, 0.04, 0.0015])
+    layers = [
+        len(np.unique(body.positions[:, 2].round(9)))
+        for body in (lattice.fill(plate, spacing, lattice.LEAST_ACROSS, together=True) for spacing in (0.0, 0.002))
+    ]
+    assert layers[1] >= layers[0] > 1
