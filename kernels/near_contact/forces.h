@@ -1,7 +1,7 @@
 // Forces and torques between near balls, in units of μ0/4π: of short-range parts, of quadrupoles and of contacts.
 // Lengths are in radii of the ball, so that products of sources stay in float32's range.
 #pragma once
-#include "near_contact/sweeps.h"
+#include "near_contact/image_forces.h"
 
 namespace warpmag {
 
@@ -126,6 +126,11 @@ CUDA_CALLABLE inline Vector sum_forces(const NearArrays& a, int i, const Sources
         const PairForce q = quadrupole_force(own, other, u, g2, apart, g3, w, size * slope[1]);
         total += d.across;
         total += ((d.radial + q.radial) * u + q.across);
+        if constexpr (IMAGES > 0) {
+            const Vector force = d.across + ((d.radial + q.radial) * u + q.across);
+            if (any(image_slot(a, partners.of(s)).live))
+                total += image_force(a, i, s, partners.of(s), sources, force, s < contact_slots);
+        }
     }
     for (int s = share(); s - share() < contact_slots; s += SHARES) {
         const int* counterpart = list_at(a.counterpart, CONTACT_SLOTS, s, i);

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpmag.kernels.near_contact import contact_table, nonuniform
+from warpmag.kernels.near_contact import contact_table, images, nonuniform
 from warpmag.kernels.pairs import neighbors
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.wrench import MU0
@@ -61,14 +61,14 @@ _EIGENVALUES = 0.4, 4.0
 """Bounds of the eigenvalues of 1 + ΔC M, scaled by s, in piles of any permeability, touching or overlapping."""
 
 
-def _constants() -> dict[str, int | float]:
+def _constants(with_images: bool) -> dict[str, int | float]:
     """Return the constants of the headers."""
     low, high = (bound**0.5 for bound in _EIGENVALUES)
     first, last, nodes = contact_table.LOG_GAPS
     fades = {name: getattr(contact_table, name) for name in ("MOST_SHARED", "LEAST_RATIO", "CONTACT_GAP", "DEEPEST")}
     fades["QUADRUPOLE_GAP"] = [distance - 2.0 for distance in contact_table.QUADRUPOLE_REACH]
     fades["QUADRUPOLE_OVERLAP"] = contact_table.QUADRUPOLE_OVERLAP
-    return _ROWS | nonuniform.constants() | dict(
+    return _ROWS | nonuniform.constants() | images.constants(with_images) | dict(
         GROUP=GROUP, CANDIDATES=CANDIDATES, NEAR_SLOTS=NEAR_SLOTS, CONTACT_SLOTS=CONTACT_SLOTS, SWEEPS=SWEEPS,
         MARGIN=MARGIN, HALF_RANGE=0.5 * contact_table.RANGE, HALF_REACH=0.5 * contact_table.REACH,
         SMALLEST_GAP=contact_table.SMALLEST_GAP, SOFTNESS=contact_table.SOFTNESS, NODES=nodes, FIRST_NODE=first,
@@ -139,6 +139,8 @@ def contact_arrays(dtype) -> Any:
         torques: wp.array[vec3]  # [N·m] [n]
         # Permanent moments:
         magnets: nonuniform.magnet_arrays(dtype)
+        # Flat faces of iron:
+        faces: images.face_arrays(dtype)
 
     return ContactArrays
 
@@ -156,6 +158,7 @@ class NearContactBuffers:
     stream: wp.Stream | None  # stream of a GPU that runs in parallel with the pair sums
     # Events of that stream: its start, the write of H_near to the field's sums, and its end.
     events: tuple[wp.Event, ...]
+    reactions: images.ImageReactions | None  # on iron with faces; None without
     commands: dict  # recorded launches, so that the arrays are packed only once
 
     @property
@@ -175,7 +178,7 @@ class NearContactBuffers:
 
 def allocate(
     packed, worlds, eligible, susceptibility, material, *, ranges, magnets, single, field, movable, rotatable,
-    forces, torques, expansion=None,
+    forces, torques, expansion=None, faces=(), rotations=None,
 ) -> NearContactBuffers:  # fmt: skip
     """Return the buffers.
 
@@ -191,6 +194,8 @@ def allocate(
         movable, rotatable: True for moments whose force and torque are evaluated, shape [n].
         forces, torques: In and out [N, N·m], Warp arrays, shape [n].
         expansion: Expansions of the sources' fields about the moments (``applied/balls.h``), or None.
+        faces: Flat faces of iron bodies (``images.IronFaces``), ordered by world.
+        rotations: Rotation of each body of cells to the world, Warp array, shape [bodies].
     """
     n, dtype, device = packed.count, packed.dtype, packed.device
     balls = -(-max(n, 1) // CHUNK) * CHUNK
@@ -213,7 +218,10 @@ def allocate(
     a.movable, a.rotatable = padded(movable, 0), padded(movable & rotatable, 0)
     a.forces, a.torques = forces, torques
     _set_materials(a, radii, eligible, susceptibility, material, padded)
-    _set_pairs(a, balls, dtype, device)
+    _set_pairs(a, balls, images.IMAGES if faces else 0, dtype, device)
+    a.faces = images.allocate(balls, faces, rotations, worlds, radii, material, dtype=dtype, device=device)
+    of_bodies = [ranges[body.world][::2] for body in faces]
+    reactions = images.ImageReactions(a.faces, of_bodies, packed, forces, torques) if faces else None
     pairs, a.magnets = nonuniform.allocate(
         balls, ranges, eligible, magnets, single, movable, dtype=dtype, device=device, expansion=expansion
     )
@@ -221,7 +229,9 @@ def allocate(
     nonuniform_threads = threads_for(pairs, _PAIRS_PER_THREAD) if pairs or expansion is not None else 0
     stream = wp.Stream(device, priority=-1) if device.is_cuda else None
     events = tuple(wp.Event(device) for _ in range(3)) if device.is_cuda else ()
-    return NearContactBuffers(dtype, lists, a, reach, threads, nonuniform_threads, stream, events, commands={})
+    return NearContactBuffers(
+        dtype, lists, a, reach, threads, nonuniform_threads, stream, events, reactions, commands={}
+    )
 
 
 def _field_rows(field, n: int) -> np.ndarray:
@@ -248,7 +258,7 @@ def _set_materials(a, radii, eligible, susceptibility, material, padded) -> None
     a.tables = wp.array(lines, dtype=a.radius.dtype, device=a.radius.device)
 
 
-def _set_pairs(a, balls: int, dtype, device) -> None:
+def _set_pairs(a, balls: int, images_of_ball: int, dtype, device) -> None:
     """Set the arrays to no pairs: each slot holds the ball itself and has no counterpart."""
     chunks = balls // CHUNK
 
@@ -264,7 +274,7 @@ def _set_pairs(a, balls: int, dtype, device) -> None:
     a.counterpart = wp.array(no_counterpart, dtype=wp.int32, device=device)
     a.near_count, a.contact_count = zeros(balls, kind=wp.int32), zeros(balls, kind=wp.int32)
     a.used, a.relaxation = zeros(2, balls, kind=wp.int32), zeros(2, balls)
-    a.positions, a.sources, a.drives = zeros(balls, LINE), zeros(balls, LINE), zeros(balls, LINE)
+    a.positions, a.sources, a.drives = (zeros((1 + images_of_ball) * balls, LINE) for _ in range(3))
     a.pairs, a.pair_slopes = slots(NEAR_SLOTS, "PAIR_ROWS"), slots(NEAR_SLOTS, "PAIR_SLOPE_ROWS")
     a.conductances = slots(CONTACT_SLOTS, "CONDUCTANCE_ROWS")
     a.conductance_slopes = slots(CONTACT_SLOTS, "CONDUCTANCE_SLOPE_ROWS")
@@ -277,11 +287,11 @@ _HEADERS = dict(Positions="select", Pairs="tabulate", Sweeps="sweeps", Forces="f
 
 
 @cache
-def kernel(dtype, passes: str):
+def kernel(dtype, passes: str, with_images: bool = False):
     """Return a kernel that runs the passes of a struct in one of the headers."""
     call = f"make_passes<warpmag::{passes}>(thread, first, last, threads, team.data, arrays)"
     header, arguments = f"near_contact/{_HEADERS[passes]}.h", {**PASS_ARGUMENTS, "arrays": contact_arrays(dtype)}
-    return native_kernel(call, header, arguments, dtype=dtype, **_constants())
+    return native_kernel(call, header, arguments, dtype=dtype, **_constants(with_images))
 
 
 def _launch(buffers: NearContactBuffers, passes: str, first: int, last: int):
@@ -291,7 +301,7 @@ def _launch(buffers: NearContactBuffers, passes: str, first: int, last: int):
     for begin, end in [(first, last)] if buffers.device.is_cpu else pairwise(range(first, last + 1)):
         key = passes, begin, end
         if key not in buffers.commands:
-            native, device = kernel(buffers.dtype, passes), buffers.device
+            native, device = kernel(buffers.dtype, passes, buffers.reactions is not None), buffers.device
             command = launch_passes(native, begin, end, buffers.arrays, device=device, record_cmd=True, **sizes)
             buffers.commands[key] = command
         buffers.commands[key].launch()
@@ -307,6 +317,11 @@ def _on_side_stream(buffers: NearContactBuffers):
     with wp.ScopedStream(buffers.stream, sync_enter=False):
         yield
         buffers.stream.record_event(buffers.events[2])
+
+
+def _first_pass(buffers: NearContactBuffers) -> int:
+    """Return the first pass of a GPU: without images, none reads the moments in lines that pass 0 writes."""
+    return 0 if buffers.reactions is not None else 1
 
 
 def launch_find_pairs(buffers: NearContactBuffers):
@@ -333,7 +348,7 @@ def launch_sweeps(buffers: NearContactBuffers):
         _launch(buffers, "Sweeps", 0, _LAST_SWEEP_PASS + 1)
         return
     with _on_side_stream(buffers):
-        _launch(buffers, "Sweeps", 1, _LAST_SWEEP_PASS)
+        _launch(buffers, "Sweeps", _first_pass(buffers), _LAST_SWEEP_PASS)
         buffers.stream.record_event(buffers.events[1])
         _launch(buffers, "Sweeps", _LAST_SWEEP_PASS, _LAST_SWEEP_PASS + 1)
 
@@ -342,7 +357,7 @@ def launch_begin_forces(buffers: NearContactBuffers):
     """Begin the sweeps for the forces on a GPU, in parallel with the following launches."""
     if buffers.reach > 0.0 and buffers.stream is not None:
         with _on_side_stream(buffers):
-            _launch(buffers, "Forces", 1, _LAST_SWEEP_PASS + 1)
+            _launch(buffers, "Forces", _first_pass(buffers), _LAST_SWEEP_PASS + 1)
 
 
 def launch_add_forces(buffers: NearContactBuffers):
@@ -351,6 +366,8 @@ def launch_add_forces(buffers: NearContactBuffers):
         return
     wait(buffers)
     _launch(buffers, "Forces", 0 if buffers.stream is None else _LAST_SWEEP_PASS + 1, _LAST_SWEEP_PASS + 2)
+    if buffers.reactions is not None:
+        buffers.reactions.add()
     if buffers.nonuniform_threads:
         _launch(buffers, "NonuniformField", 0, 4)
 

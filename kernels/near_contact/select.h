@@ -3,7 +3,7 @@
 //
 // From Python: MARGIN, CANDIDATES and HALF_REACH of the search, CONTACT_GAP_HIGH, MOST_SHARED_LOW and MOST_SHARED_HIGH.
 #pragma once
-#include "near_contact/state.h"
+#include "near_contact/images.h"
 #include "pairs/pair_law.h"
 
 namespace warpmag {
@@ -35,6 +35,7 @@ CUDA_CALLABLE inline void store_position(const NearArrays& a, int i) {
     put_four(a.positions, 1, i, {zero, number_of(indices(a.kind + i)), zero, zero});
     for (int l = 0; l < WIDTH; ++l) {
         if (a.group[i + l] < 0) continue;
+        if constexpr (IMAGES > 0) find_images(a, i + l);
         const Real* found_at = a.found_at + 3 * (size_t)(i + l);
         const Real x = row[l] - found_at[0], y = row[stride + l] - found_at[1], z = row[2 * stride + l] - found_at[2];
         const Real limit = MARGIN * row[3 * stride + l];
@@ -59,11 +60,23 @@ CUDA_CALLABLE inline void append(const NearArrays& a, int i, const int* j, Index
 #endif
 }
 
+// Number of balls that may be near ball i. Images come after other balls.
+CUDA_CALLABLE inline int count_candidates(const NearArrays& a, int i) {
+    if (a.group[i] < 0 || a.candidate_count[i] > CANDIDATES) return 0;
+    int count = a.candidate_count[i];
+    for (int k = 0; k < IMAGES && a.image_face[(size_t)k * a.balls + i] >= 0; ++k) ++count;
+    return count;
+}
+CUDA_CALLABLE inline int candidate_of(const NearArrays& a, int i, int k) {
+    const int others = a.candidate_count[i];
+    return k < others ? a.candidate[(size_t)i * CANDIDATES + k] : (k - others + 1) * a.balls + i;
+}
+
 // Lists the near balls of balls i and writes their counts and weights. Balls with too many near balls have none.
 CUDA_CALLABLE inline void select(const NearArrays& a, int i) {
     int candidates[WIDTH], filled[WIDTH], touching[WIDTH], largest = 0;
     for (int l = 0; l < WIDTH; ++l) {
-        candidates[l] = a.group[i + l] < 0 || a.candidate_count[i + l] > CANDIDATES ? 0 : a.candidate_count[i + l];
+        candidates[l] = count_candidates(a, i + l);
         largest = candidates[l] > largest ? candidates[l] : largest;
         filled[l] = 0;
     }
@@ -74,8 +87,7 @@ CUDA_CALLABLE inline void select(const NearArrays& a, int i) {
         for (int first = 0; first < largest; first += SHARES) {
             const int k = first + share();
             int j[WIDTH];
-            for (int l = 0; l < WIDTH; ++l)
-                j[l] = k < candidates[l] ? a.candidate[(size_t)(i + l) * CANDIDATES + k] : i + l;
+            for (int l = 0; l < WIDTH; ++l) j[l] = k < candidates[l] ? candidate_of(a, i + l, k) : i + l;
             const Four o = four_at(a.positions, 0, j);
             const Vector r = {o.x - at.x, o.y - at.y, o.z - at.z};
             const Number d2 = dot(r, r), d = root(d2), sum = size + o.w;
@@ -96,6 +108,12 @@ CUDA_CALLABLE inline void select(const NearArrays& a, int i) {
         a.near_count[i + l] = fits ? filled[l] : 0;
         a.contact_count[i + l] = fits ? touching[l] : 0;
         a.positions[LINE * (size_t)(i + l) + 4] = fits ? lane_of(weight, l) : 0;
+        for (int k = 0; k < IMAGES; ++k) {
+            const size_t image = (size_t)k * a.balls + i + l;
+            if (a.image_face[image] < 0) break;
+            const Real faded = a.image_view[VIEW_ROWS * image + WEIGHT];
+            a.positions[LINE * (image + a.balls) + 4] = fits ? lane_of(weight, l) * faded : 0;
+        }
     }
 }
 

@@ -1,6 +1,7 @@
 // NearArrays of the passes over near pairs, and cache lines that balls write for others to read.
 //
-// near_pairs.py documents the arrays. It passes the numbers of their rows and slots, and UNIT, μ0/4π [T·m/A].
+// near_pairs.py documents the arrays. It passes the numbers of their rows and slots, IMAGES of images.h, and UNIT,
+// μ0/4π [T·m/A].
 #pragma once
 #include "material/curves.h"
 #include "near_contact/group_rows.h"
@@ -13,10 +14,13 @@ namespace warpmag {
 struct NearArrays {
     int balls, moment_stride, kinds, common_curve;
     int *group, *field_row, *kind, *candidate, *candidate_count, *moved, *used, *counterpart, *movable, *rotatable,
-        *near, *near_count, *contact_count, *curve, *partner_begin, *partner_end, *magnet_movable;
+        *near, *near_count, *contact_count, *curve, *partner_begin, *partner_end, *magnet_movable, *face_begin,
+        *face_end, *face, *face_cells, *cell_curve, *image_face;
     Real *packed, *radius, *inverse_saturation, *curve_slope, *hardness, *relaxation, *pairs, *conductances, *state,
         *last_state, *sources, *drives, *field, *cached, *pair_slopes, *conductance_slopes, *pair_forces, *partial,
-        *found_at, *tables, *positions, *forces, *torques, *curve_tables, *single, *response, *bounds, *expansion;
+        *found_at, *tables, *positions, *forces, *torques, *curve_tables, *single, *response, *bounds, *expansion,
+        *face_plane, *face_edge, *face_origin, *face_rotation, *cell_slope, *cell_inverse_saturation, *image_view,
+        *image_wrench;
 
     template <class Given> CUDA_CALLABLE explicit NearArrays(const Given& a) {
         balls = a.balls, moment_stride = a.moment_stride, kinds = a.kinds, common_curve = a.common_curve;
@@ -40,6 +44,13 @@ struct NearArrays {
         partner_begin = magnets.partner_begin.data, partner_end = magnets.partner_end.data;
         magnet_movable = magnets.movable.data, single = magnets.single.data, bounds = magnets.bounds.data;
         response = magnets.response.data, expansion = magnets.expansion.data;
+        // images in faces of iron
+        const auto& faces = a.faces;
+        face_begin = faces.begin.data, face_end = faces.end.data, face = faces.face.data, cell_curve = faces.curve.data;
+        face_cells = faces.cells.data, face_plane = faces.plane.data, face_edge = faces.edge.data;
+        face_origin = faces.origin.data, face_rotation = (Real*)faces.rotation.data, cell_slope = faces.slope.data;
+        cell_inverse_saturation = faces.inverse_saturation.data, image_face = faces.image_face.data;
+        image_view = faces.view.data, image_wrench = faces.wrench.data;
     }
 
     CUDA_CALLABLE Real* pair(int s, int i) const { return slot_at(pairs, NEAR_SLOTS, PAIR_ROWS, s, i); }
@@ -78,15 +89,15 @@ struct Drive {
     Traceless t;
 };
 
-// Sources of balls j. A CPU reads m from the line of the ball. A GPU has no pass that writes it there, and reads the
-// packed moments.
+// True where moments are in the lines of sources: on a CPU, and if balls have images. Otherwise a GPU has no pass that
+// writes them there, and reads the packed moments.
+constexpr bool MOMENTS_IN_LINES = SHARES == 1 || IMAGES > 0;
+
+// Sources of balls j.
 CUDA_CALLABLE inline Sources sources_at(const NearArrays& arrays, const int* j) {
     const Four a = four_at(arrays.sources, 0, j), b = four_at(arrays.sources, 1, j), c = four_at(arrays.sources, 2, j);
-#if defined(__CUDA_ARCH__)
-    const Vector m = arrays.own_moment(*j);
-#else
-    const Vector m = {c.y, c.z, c.w};
-#endif
+    Vector m = {c.y, c.z, c.w};
+    if constexpr (!MOMENTS_IN_LINES) m = arrays.own_moment(*j);
     return {{m.x - b.y, m.y - b.z, m.z - b.w}, m, -c.x, {a.x, a.y, a.z, a.w, b.x}};
 }
 CUDA_CALLABLE inline Drive drive_at(const NearArrays& arrays, const int* j) {

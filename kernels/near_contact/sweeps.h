@@ -4,7 +4,7 @@
 // Numbers of a ball's state, and of sums over its slots: 0 to 4 are xx, yy, xy, yz, zx of a quadrupole, 5 to 7 a
 // dipole, 13 a source. From Python: PACE and MOMENTUM of a step, OWN_SOURCE and OWN_DIPOLE of M, SWEEPS.
 #pragma once
-#include "near_contact/state.h"
+#include "near_contact/images.h"
 
 namespace warpmag {
 
@@ -125,6 +125,7 @@ template <bool FIRST> CUDA_CALLABLE inline Vector find_drive(const NearArrays& a
         if (quadrupole) put(rows + (c + 8) * CHUNK, (p - 1) * own - p * square * square * size * other);
     }
     store_line(a.drives, i, drive, {response.weight, zero, zero});
+    mirror_drives(a, i);
     if (FIRST && share() == 0) {
         put(rows + 17 * CHUNK, response.p);
         put(rows + 18 * CHUNK, response.weight);
@@ -207,22 +208,26 @@ CUDA_CALLABLE inline void relax(const NearArrays& a, int i) {
         put(last_rows + c * CHUNK, current);
         put(rows + c * CHUNK, moved[k]);
     }
-    store_line(a.sources, i, moved, SHARES == 1 ? a.own_moment(i) : Vector{zero, zero, zero});
+    store_line(a.sources, i, moved, MOMENTS_IN_LINES ? a.own_moment(i) : Vector{zero, zero, zero});
+    mirror_sources(a, i);
 }
 
-// Writes moments to the lines of sources.
+// Writes moments to the lines of sources, and the images' lines.
 CUDA_CALLABLE inline void store_moment(const NearArrays& a, int i) {
     const Vector m = a.own_moment(i);
-    put_four(a.sources, 2, i, {numbers(rows_at(a.state, STATE_ROWS, i) + 13 * CHUNK), m.x, m.y, m.z});
+    if (share() == 0)
+        put_four(a.sources, 2, i, {numbers(rows_at(a.state, STATE_ROWS, i) + 13 * CHUNK), m.x, m.y, m.z});
+    store_responses(a, i);
+    mirror_sources(a, i);
 }
 
-// Pass 0 writes moments on a CPU; then each sweep is a pass for the drive and one for the step. Returns 4π H_near after
-// the last drive.
+// Pass 0 writes moments to lines, where needed; then each sweep is a pass for the drive and one for the step. Returns
+// 4π H_near after the last drive.
 CUDA_CALLABLE inline Vector sweep_pass(const NearArrays& a, int pass, int i) {
     if (pass == 1) return find_drive<true>(a, i);
     if (pass % 2 == 1) return find_drive<false>(a, i);
     if (pass > 0) relax(a, i);
-    else if (SHARES == 1) store_moment(a, i);
+    else if (MOMENTS_IN_LINES) store_moment(a, i);
     const Number zero = numbers(a.radius + i) * Real(0);
     return {zero, zero, zero};
 }

@@ -133,7 +133,7 @@ CUDA_CALLABLE inline void tabulate_contact(const NearArrays& arrays, int i, int 
 CUDA_CALLABLE inline void find_counterpart(const NearArrays& a, int i, int s, int j) {
     int other_slot = -1;
     auto takes_part = [&](int ball) { return a.positions[LINE * (size_t)ball + 4] > 0; };
-    if (s < a.contact_count[i] && takes_part(i) && takes_part(j))
+    if (s < a.contact_count[i] && j < a.balls && takes_part(i) && takes_part(j)) // an image's is its ball's, mirrored
         for (int slot = 0; slot < a.contact_count[j]; ++slot)
             other_slot = *list_at(a.near, NEAR_SLOTS, slot, j) == i ? slot : other_slot;
     *list_at(a.counterpart, CONTACT_SLOTS, s, i) =

@@ -23,6 +23,7 @@ from warpmag.kernels.induction.energy import launch_energy
 from warpmag.kernels.induction.solve_state import launch_add_bias
 from warpmag.kernels.material.curves import LINEAR
 from warpmag.kernels.near_contact import near_pairs, nonuniform
+from warpmag.kernels.near_contact.images import IronFaces
 from warpmag.kernels.pairs.evaluate import GIVEN, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
 from warpmag.kernels.pairs.pair_law import Quantity
@@ -87,6 +88,8 @@ class MomentSystem:
             cells (``shapes.demagnetization.Coupling``).
         sources: Coils and field maps; their bodies have the same numbers as in ``bodies``.
         solids: Permanent bodies with a closed-form near field, ordered by world.
+        faces: Flat faces of inducible bodies of ``couplings``, ordered by world. The contact model ``multipole`` has
+            mirror images of balls in them.
         dtype: ``float32`` or ``float64``.
         device: Warp device; None means Warp's default.
 
@@ -142,6 +145,7 @@ class MomentSystem:
         couplings: Sequence[tuple[int, Coupling]] = (),
         sources: Sequence[AppliedSource] = (),
         solids: Sequence[SolidMagnet] = (),
+        faces: Sequence[IronFaces] = (),
         dtype: str = "float32",
         device=None,
     ):
@@ -166,7 +170,7 @@ class MomentSystem:
             self._include_cells(couplings, {solid.first for solid in solids}, susceptibility)
         self._make_wrench(layout, rotatable)
         self._permanent_fields = None
-        self._near = self._make_near_contacts(layout, rotatable, susceptibility) if near else None
+        self._near = self._make_near_contacts(layout, rotatable, susceptibility, faces) if near else None
         limits = float(settings.rtol), int(settings.max_evaluations)
         solve_state.bind(self._induction, self._packed, self.material, self.moments, *limits)
         responses = self._make_responses(layout, couplings) if theta else None
@@ -305,7 +309,7 @@ class MomentSystem:
             "zeeman": evaluations(Quantity.FORCE, self._effective),
         }
 
-    def _make_near_contacts(self, layout: MomentLayout, rotatable, susceptibility):
+    def _make_near_contacts(self, layout: MomentLayout, rotatable, susceptibility, faces):
         magnets = layout.permanent | (self.material.curve.numpy() == LINEAR)
         for solid in () if self.sources is None else self.sources.solids:  # closed forms replace their moments
             magnets[solid.first : solid.first + solid.count] = solid.response > 0.0
@@ -314,6 +318,8 @@ class MomentSystem:
             ranges=self.world_ranges, magnets=magnets, single=layout.single, field=self._inducible_field,
             movable=layout.movable, rotatable=rotatable, forces=self.forces, torques=self.torques,
             expansion=None if self.source_interaction is None else self.source_interaction.expansion,
+            faces=[body for body in faces if layout.balls[layout.worlds == body.world].any()],
+            rotations=self.rotations,
         )  # fmt: skip
 
     @property

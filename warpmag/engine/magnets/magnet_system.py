@@ -6,6 +6,7 @@ import numpy as np
 from warpmag.declarations.magnets import LINEAR_CURVE, MagneticSettings
 from warpmag.engine.magnets.grouping import BodyMagnet
 from warpmag.kernels.applied.solids import SolidMagnet
+from warpmag.kernels.near_contact.images import IronFaces
 from warpmag.moments.layout import MomentMaterial
 from warpmag.moments.system import MomentSystem, SolverSettings
 
@@ -58,11 +59,24 @@ def make_system(
         ),
         couplings=[(k, magnet.lattice.coupling) for k, magnet in coupled],
         solids=[solid for _, solid in solids],
+        faces=[_iron_faces(number, k, magnet) for number, (k, magnet) in enumerate(coupled) if _has_faces(magnet)],
         body_extent=_largest_extent(magnets, moment_bodies, moments_move),
         sources=sources,
         device=model.device,
     )
     return system, [magnet.body for _, magnet in coupled], [body for body, _ in solids]
+
+
+def _has_faces(magnet: BodyMagnet) -> bool:
+    return magnet.lattice.faces is not None and len(magnet.lattice.faces.planes) > 0
+
+
+def _iron_faces(number: int, first: int, magnet: BodyMagnet) -> IronFaces:
+    """Return the flat faces of the magnet with coupling ``number``. ``first`` is its first moment in the system."""
+    lattice, faces = magnet.lattice, magnet.lattice.faces
+    assert faces is not None
+    count = len(lattice.volumes)
+    return IronFaces(number, first, count, magnet.world, lattice.positions[0], faces.planes, faces.edges)
 
 
 def _solid_magnet(first: int, magnet: BodyMagnet, movable: bool, part) -> SolidMagnet:

@@ -14,6 +14,7 @@ from warpmag.errors import InputError
 from warpmag.moments.arrays import RADIUS_RANGE
 from warpmag.shapes import lattice, polyhedra
 from warpmag.shapes.demagnetization import Coupling, coupling
+from warpmag.shapes.flat_faces import FlatFaces, faces_of_mesh, faces_of_polyhedron, joined
 from warpmag.shapes.polyhedra import Polyhedron
 from warpmag.shapes.softening import softened
 from warpmag.shapes.solids import boxes_meet
@@ -55,6 +56,7 @@ class BodyLattice:
     counts: np.ndarray  # number of moments of each shape
     coupling: Coupling | None = None  # tensors between inducible cells, minus the pair law of balls
     solids: tuple[ClosedForm, ...] = ()  # closed forms of the near field of a permanent magnet
+    faces: FlatFaces | None = None  # flat faces of inducible cells
 
 
 class ShapeSampler:
@@ -116,7 +118,22 @@ class ShapeSampler:
         if fixed:
             return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solids=parts)
         cells = with_surface_response(softened(coupling(filled, filled.radii), filled), filled, solids)
-        return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells, parts)
+        faces = None if permanent else joined([self._faces(*pair) for pair in zip(shapes, solids, strict=True)])
+        return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells, parts, faces)
+
+    def _faces(self, shape: int, solid: lattice.Solid) -> FlatFaces:
+        """Return the flat faces of a box, a cylinder or a mesh in the frame of its body; none of other shapes."""
+        kinds, kind, scale = newton.GeoType, self._types[shape], self._scales[shape]
+        if kind == kinds.BOX:
+            return faces_of_polyhedron(polyhedra.box(scale).posed(solid.position, solid.rotation), 6)
+        if kind == kinds.CYLINDER:
+            surface = polyhedra.cylinder(scale[0], scale[1]).posed(solid.position, solid.rotation)
+            return faces_of_polyhedron(surface, 2)
+        if kind in (kinds.MESH, kinds.CONVEX_MESH):
+            source = self._sources[shape]
+            vertices = solid.to_body(np.asarray(source.vertices, float) * scale)
+            return faces_of_mesh(vertices, np.asarray(source.indices).reshape(-1, 3))
+        return joined([])
 
     def _polyhedra(self, shapes: list[int], solids: list[lattice.Solid]) -> list[Polyhedron]:
         """Return the surfaces of separate boxes and cylinders, in the frame of the body; empty for other shapes."""

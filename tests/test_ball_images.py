@@ -1,0 +1,109 @@
+"""Mirror images of balls in flat faces of iron: against two balls, an energy, and exact solutions of mirrored balls."""
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from bench import iron
+from bench.reference import spheres
+from bench.reference.iron_bodies import SETUPS, load
+from bench.reference.near_contact import NearContacts
+from bench.reference.oracle import MU0
+from bench.reference.near_contact import ramp
+from bench.systems import moment_system
+from warpmag.kernels.near_contact.images import EDGE, IronFaces
+from warpmag.shapes import demagnetization, flat_faces, lattice, polyhedra
+
+R, HALF = 0.005, np.array([0.012, 0.01, 0.002])
+PLATE = lattice.fill([lattice.box(HALF)], 0.005, lattice.LEAST_ACROSS, together=True)
+FACES = flat_faces.faces_of_polyhedron(polyhedra.box(HALF), 6)
+N = len(PLATE.volumes)
+FAINT = {"saturation": 1e9, "rtol": 1e-9, "dtype": "float64"}  # linear, in fields of 1e4 A/m
+
+
+class BallsOnPlate:
+    """Balls over an iron plate, at centers in the frame of the plate [m]."""
+
+    def __init__(self, centers, device, *, susceptibility=1000.0, field=(3e3, -2e3, 1e4), **settings):
+        self.centers, self.field = np.asarray(centers, float), np.asarray(field, float)
+        coupling = demagnetization.coupling(PLATE, PLATE.radii)
+        iron_faces = IronFaces(0, 0, N, 0, PLATE.positions[0], FACES.planes, FACES.edges)
+        count = len(self.centers)
+        self.system = moment_system(
+            radii=np.append(PLATE.radii, np.full(count, R)), bodies=np.append(np.zeros(N, int), 1 + np.arange(count)),
+            couplings=[(0, coupling)], faces=[iron_faces], susceptibility=susceptibility, contact_model="multipole",
+            external_field=self.field, device=device, **{**FAINT, **settings},
+        )  # fmt: skip
+
+    def energy(self, shifts=0.0, turn=None, turned_plate=None):
+        """Energy [J] with shifted balls; ``turn`` rotates all, ``turned_plate`` the plate about the first ball."""
+        turn, plate = turn or Rotation.identity(), turned_plate or Rotation.identity()
+        cells = plate.apply(PLATE.positions - self.centers[0]) + self.centers[0]
+        self.system.positions.assign(turn.apply(np.concatenate([cells, self.centers + shifts])))
+        self.system.rotations.assign((turn * plate).as_quat()[None])
+        self.system.solve()
+        assert self.system.converged.numpy().all()
+        return -0.5 * MU0 * (self.system.moments.numpy().astype(float) @ self.field).sum()
+
+    def wrench(self):
+        """Forces on moments and torques about their positions."""
+        self.system.apply_forces()
+        return self.system.forces.numpy().astype(float), self.system.torques.numpy().astype(float)
+
+
+@pytest.mark.parametrize("dtype, error", [("float64", 1e-6), ("float32", 2e-3)])
+def test_an_image_is_a_ball(dtype, error, device):
+    """The image adds field and half the energy of two balls, in a turned frame."""
+    height = R + 2e-4
+    rtol = 1e-11 if dtype == "float64" else 1e-5
+    balls = BallsOnPlate([[0.001, 0.002, HALF[2] + height]], device, susceptibility=1e6, dtype=dtype, rtol=rtol)
+    turn = Rotation.from_rotvec([0.4, -0.3, 0.8])
+    balls.energy(turn=turn)
+    balls.wrench()
+    m = balls.system.moments.numpy()[N].astype(float)
+    n = turn.apply([0.0, 0.0, 1.0])
+    two = NearContacts([height * n, -height * n], R, 1e6)
+    moments = np.array([m, 2.0 * (n @ m) * n - m])
+    field, forces = two.coupling() @ moments.ravel(), two.forces(moments)
+    near = balls.system._near.arrays
+    chunk, lane = divmod(N, 16)
+    assert np.allclose(near.field.numpy()[chunk, :, lane] / (4 * np.pi), field[:3], atol=error * np.abs(field).max())
+    wrench = MU0 / (4 * np.pi) * near.faces.wrench.numpy()[0, N].astype(float)
+    assert np.allclose(wrench[:3], forces[0], atol=error * np.abs(forces).max())
+    torque = MU0 * np.cross(m, field[:3])
+    assert np.allclose(wrench[3:], torque, atol=error * R * np.abs(forces).max())
+
+
+ARRANGEMENTS = {
+    "over an edge": [[0.0105, 0.002, HALF[2] + R + 3e-4]],
+    "over a corner": [[0.0105, -0.0083, HALF[2] + R + 1e-3]],
+    "three in contact": [
+        [0.001, 0.002, HALF[2] + R + 2e-4],
+        [0.0085, -0.0048, HALF[2] + R + 1e-4],
+        [0.0035, -0.0025, HALF[2] + R + 0.0081],
+    ],
+}
+
+
+@pytest.mark.parametrize("name", ARRANGEMENTS)
+def test_forces_and_torques_are_derivatives_of_the_energy(name, device):
+    """Central differences; the plate turns about the first ball."""
+    balls = BallsOnPlate(ARRANGEMENTS[name], device)
+    step, angle = 1e-6, 1e-4
+    slopes, count = np.zeros((len(balls.centers), 3)), len(balls.centers)
+    for ball, axis in np.ndindex(count, 3):
+        shift = np.zeros((count, 3))
+        shift[ball, axis] = step
+        slopes[ball, axis] = (balls.energy(-shift) - balls.energy(shift)) / (2.0 * step)
+    spins = [Rotation.from_rotvec(angle * axis) for axis in np.eye(3)]
+    turning = [(balls.energy(turned_plate=s.inv()) - balls.energy(turned_plate=s)) / (2.0 * angle) for s in spins]
+    balls.energy()
+    forces, torques = balls.wrench()
+    x, size = balls.system.positions.numpy(), np.abs(forces[N:]).max()
+    np.testing.assert_allclose(forces[N:], slopes, atol=1e-5 * size)
+    torque = (torques[:N] + np.cross(x[:N] - balls.centers[0], forces[:N])).sum(axis=0)
+    np.testing.assert_allclose(torque, turning, atol=1e-5 * R * size)
+    assert np.abs(forces.sum(axis=0)).max() < 1e-9 * size
+    applied = MU0 * np.cross(balls.system.moments.numpy(), balls.field).sum(axis=0)
+    assert np.abs((torques + np.cross(x, forces)).sum(axis=0) - applied).max() < 1e-7 * R * size
