@@ -66,7 +66,7 @@ def model_forces(
     setup: Setup, cells: int, device, contact_model: str
 ) -> tuple[np.ndarray, np.ndarray, warpmag.Magnetics]:
     """Forces [N] and moments [A·m²] of the bodies, shape [n, 3], in a Newton model; and its magnets."""
-    model = model_of(setup, cells, device)
+    model = model_of(setup, cells, device, single_balls=contact_model == "multipole")
     settings = {"external_field": setup.field, "rtol": _SETTLED, "contact_model": contact_model}
     magnetics, state = warpmag.Magnetics(model, **settings), model.state()
     state.clear_forces()
@@ -76,12 +76,12 @@ def model_forces(
     return state.body_f.numpy()[:, :3].astype(float), moments, magnetics
 
 
-def model_of(setup: Setup, cells: int, device) -> newton.Model:
-    """Model of a setup with about ``cells`` moments in each body; 0 means automatic numbers."""
+def model_of(setup: Setup, cells: int, device, *, single_balls: bool = False) -> newton.Model:
+    """Model of a setup with about ``cells`` moments in each body; 0 means automatic numbers, as of ``single_balls``."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     warpmag.register_custom_attributes(builder)
     for body in setup.bodies:
-        _add(builder, body, cells)
+        _add(builder, body, 0 if single_balls and body.shape == "ball" else cells)
     return builder.finalize(device=device)
 
 

@@ -1,25 +1,23 @@
-"""Mirror images of balls in flat faces of iron: against two balls, an energy, and exact solutions of mirrored balls."""
+"""Mirror images of balls in flat faces of iron: against two balls, their energy, and finite elements."""
 
 import numpy as np
 import pytest
-import warp as wp
 from scipy.spatial.transform import Rotation
 
 from bench import iron
-from bench.reference import spheres
+from bench.prisms import prism
 from bench.reference.iron_bodies import SETUPS, load
 from bench.reference.near_contact import NearContacts
 from bench.reference.oracle import MU0
-from bench.reference.near_contact import ramp
 from bench.systems import moment_system
-from warpmag.kernels.near_contact.images import EDGE, IronFaces
+from warpmag.kernels.near_contact.images import IronFaces
 from warpmag.shapes import demagnetization, flat_faces, lattice, polyhedra
 
 R, HALF = 0.005, np.array([0.012, 0.01, 0.002])
 PLATE = lattice.fill([lattice.box(HALF)], 0.005, lattice.LEAST_ACROSS, together=True)
 FACES = flat_faces.faces_of_polyhedron(polyhedra.box(HALF), 6)
 N = len(PLATE.volumes)
-FAINT = {"saturation": 1e9, "rtol": 1e-9, "dtype": "float64"}  # linear, in fields of 1e4 A/m
+FAINT = {"saturation": 1e9, "rtol": 1e-10, "dtype": "float64"}  # linear, in fields of 1e4 A/m
 
 
 class BallsOnPlate:
@@ -76,8 +74,8 @@ def test_an_image_is_a_ball(dtype, error, device):
 
 
 ARRANGEMENTS = {
-    "over an edge": [[0.0105, 0.002, HALF[2] + R + 3e-4]],
-    "over a corner": [[0.0105, -0.0083, HALF[2] + R + 1e-3]],
+    "over an edge": [[0.0111, 0.002, HALF[2] + R + 3e-4]],
+    "over a corner": [[0.0112, -0.0094, HALF[2] + R + 1e-3]],
     "three in contact": [
         [0.001, 0.002, HALF[2] + R + 2e-4],
         [0.0085, -0.0048, HALF[2] + R + 1e-4],
@@ -88,9 +86,9 @@ ARRANGEMENTS = {
 
 @pytest.mark.parametrize("name", ARRANGEMENTS)
 def test_forces_and_torques_are_derivatives_of_the_energy(name, device):
-    """Central differences; the plate turns about the first ball."""
+    """Central differences over 1/200 of the narrowest gap; the plate turns about the first ball."""
     balls = BallsOnPlate(ARRANGEMENTS[name], device)
-    step, angle = 1e-6, 1e-4
+    step, angle = 5e-7, 1e-4
     slopes, count = np.zeros((len(balls.centers), 3)), len(balls.centers)
     for ball, axis in np.ndindex(count, 3):
         shift = np.zeros((count, 3))
@@ -101,9 +99,52 @@ def test_forces_and_torques_are_derivatives_of_the_energy(name, device):
     balls.energy()
     forces, torques = balls.wrench()
     x, size = balls.system.positions.numpy(), np.abs(forces[N:]).max()
-    np.testing.assert_allclose(forces[N:], slopes, atol=1e-5 * size)
+    np.testing.assert_allclose(forces[N:], slopes, atol=3e-5 * size)
     torque = (torques[:N] + np.cross(x[:N] - balls.centers[0], forces[:N])).sum(axis=0)
-    np.testing.assert_allclose(torque, turning, atol=1e-5 * R * size)
+    np.testing.assert_allclose(torque, turning, atol=3e-5 * R * size)
     assert np.abs(forces.sum(axis=0)).max() < 1e-9 * size
     applied = MU0 * np.cross(balls.system.moments.numpy(), balls.field).sum(axis=0)
     assert np.abs((torques + np.cross(x, forces)).sum(axis=0) - applied).max() < 1e-7 * R * size
+
+
+def test_images_fade_as_the_iron_saturates(device):
+    """The response is the mean of χ/(χ + 2) of the cells, from the slope 1 - (M/Ms)² of the curve."""
+    saturation, field = 1e5, (1.5e4, 0.0, 7e3)
+    settings = {"saturation": saturation, "susceptibility": 50.0, "field": field}
+    balls = BallsOnPlate([[0.001, 0.002, HALF[2] + 1.1 * R]], device, **settings)
+    balls.energy()
+    balls.wrench()
+    magnetizations = balls.system.moments.numpy()[:N] / PLATE.volumes[:, None]
+    chi = 50.0 * (1.0 - (np.linalg.norm(magnetizations, axis=1) / saturation) ** 2)
+    distances = np.linalg.norm(PLATE.positions - [0.001, 0.002, HALF[2]], axis=1)
+    weights = PLATE.volumes / (1.0 + (distances / R) ** 2) ** 3
+    response = balls.system._near.arrays.faces.view.numpy()[0, N, 7]
+    assert response == pytest.approx(np.average(chi / (chi + 2.0), weights=weights), rel=1e-6)
+    assert 0.1 < response < 0.9
+
+
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [("ball on plate, gap 0.2", 0.19), ("ball on plate, gap 1", 0.07), ("ball on the face of a cube, gap 0.2", 0.11)],
+)
+def test_balls_on_iron_pull_as_finite_elements_say(name, error, device):
+    """The cells are coarse for the field of the ball's moment at 5 mm. Without images 81, 31 and 68 % are missing."""
+    line = iron.errors(SETUPS[name], load()[name], device=device, contact_model="multipole")
+    assert line["converged"] and line["force_error"] < error and line["force_sum"] < 1e-5
+
+
+def test_flat_faces_of_a_mesh():
+    """A prism over an L has two concave faces, which are left out, and six rectangles; over a square, it is a box."""
+    corners = [(0.0, 0.0), (0.02, 0.0), (0.02, 0.01), (0.01, 0.01), (0.01, 0.02), (0.0, 0.02)]
+    mesh = prism(corners, 0.003)
+    faces = flat_faces.faces_of_mesh(np.asarray(mesh.vertices, float), np.asarray(mesh.indices).reshape(-1, 3))
+    assert [len(edges) for edges in faces.edges] == [4] * 6
+    square = prism([(-0.01, -0.01), (0.01, -0.01), (0.01, 0.01), (-0.01, 0.01)], 0.003)
+    faces = flat_faces.faces_of_mesh(np.asarray(square.vertices, float), np.asarray(square.indices).reshape(-1, 3))
+    box = flat_faces.faces_of_polyhedron(polyhedra.box([0.01, 0.003, 0.01]), 6)
+    order, expected = (np.lexsort(np.rint(rows.planes[:, :3]).T) for rows in (faces, box))
+    np.testing.assert_allclose(faces.planes[order], box.planes[expected], atol=1e-6)
+    for own, other in zip(order, expected, strict=True):
+        rows, others = faces.edges[own], box.edges[other]
+        rows, others = (edges[np.lexsort(np.rint(edges[:, :3]).T)] for edges in (rows, others))
+        np.testing.assert_allclose(rows, others, atol=1e-6)

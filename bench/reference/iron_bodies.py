@@ -83,9 +83,9 @@ def _cylinder(diameter: float, height: float, bottom: float, x: float = 0.0, **p
     return Body("cylinder", _millimeters(0.5 * diameter, 0.5 * height), center, **properties)
 
 
-def _ball(bottom: float) -> Body:
+def _ball(bottom: float, x: float = 0.0) -> Body:
     """Iron ball of 10 mm from the height of its lowest point [mm]."""
-    return Body("ball", _millimeters(5.0), _millimeters(0.0, 0.0, bottom + 5.0))
+    return Body("ball", _millimeters(5.0), _millimeters(x, 0.0, bottom + 5.0))
 
 
 def _box(sides, bottom: float, x: float = 0.0, **properties) -> Body:
@@ -171,6 +171,10 @@ def _assembled_setups() -> dict[str, Setup]:
     setups["tilted cube over cube, gap 0.5"] = Setup(cubes, (0.0, 0.0, _FIELD))
     plate, disc = _box((40.0, 40.0, 3.0), 0.0), _cylinder(20.0, 5.0, 4.0, 20.0, **_magnet())
     setups["magnet over the edge of iron plate 3, gap 1"] = Setup((plate, disc))
+    for place in (7.0, 9.0):
+        bodies = _box((20.0, 20.0, 20.0), -20.0), _ball(0.2, place)
+        name = f"ball on the face of a cube, {10.0 - place:g} from its edge, gap 0.2"
+        setups[name] = Setup(bodies, (0.0, 0.0, _FIELD))
     return setups
 
 

@@ -3,10 +3,11 @@
 | module | contents |
 |---|---|
 | contact_table | constants, and the table of two balls |
+| images | images of balls in flat faces of iron; ``images.h`` and ``image_forces.h`` have the passes |
 | near_pairs | buffers and launches; ``select.h``, ``tabulate.h``, ``sweeps.h`` and ``forces.h`` have the passes |
 | nonuniform | balls in the non-uniform field of permanent magnets; ``nonuniform.h`` has the passes |
 
-May import ``shared``, ``material``, ``pairs`` and ``applied``.
+May import ``shared``, ``material``, ``pairs``, ``applied`` and ``cells``.
 
 Close to contact the flux between two permeable balls concentrates in the gap, and dipoles miss most of the force. As in
 Bonnecaze and Brady's method for suspensions, the far field remains many-body. The missing part is added for each pair,

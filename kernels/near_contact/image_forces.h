@@ -67,8 +67,8 @@ CUDA_CALLABLE inline void put_wrench(const NearArrays& a, const ImageSlot& slot,
             a.image_wrench[6 * (size_t)slot.at[l] + c] = lane_of(rows[c], l);
 }
 
-// Completes the force of slot s if it holds an image: ``force`` is that of sources. Returns the force that an image adds
-// to ``force`` and to the ball's own half of the contact.
+// Completes the force of slot s if it holds an image: ``force`` is that of sources. Returns the force that an image
+// adds to ``force`` and to the ball's own half of the contact.
 CUDA_CALLABLE inline Vector image_force(const NearArrays& a, int i, int s, const int* partner, const Sources& own,
                                         Vector force, bool contact) {
     const ImageSlot slot = image_slot(a, partner);

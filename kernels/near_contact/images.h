@@ -1,8 +1,8 @@
 // Mirror images of balls in flat faces of iron. images.py has the physics and the arrays.
 //
-// Image k of ball i is number (k + 1) · balls + i in the lines that balls write for others to read. Only its own ball is
-// near it. From Python: IMAGES, the images of a ball, 0 without faces; VIEW_ROWS; EDGE, the distance from an edge over
-// which an image fades; and DEEPEST_CENTER, the height of a ball's center below which it has no image.
+// Image k of ball i is number (k + 1) · balls + i in the lines that balls write for others to read. Only its own ball
+// is near it. From Python: IMAGES, the images of a ball, 0 without faces; VIEW_ROWS; EDGE, the distance from an edge
+// over which an image fades; and DEEPEST_CENTER, the height of a ball's center below which it has no image.
 #pragma once
 #include "cells/rotation.h"
 #include "near_contact/state.h"

@@ -1,13 +1,12 @@
 """Mirror images of balls in flat faces of iron.
 
-To a ball near a flat face, iron of high permeability looks like a mirror: the ball interacts with its image, a ball of
-the mirrored multipoles with charges of the opposite sign. A dipole m becomes 2 (n·m) n − m, with the normal n. The cells
-of the iron respond to the ball's moment, but are too coarse for its higher multipoles and for the flux through a contact.
-So the image takes part in the near-contact model as a near ball of its own ball, beyond the dipoles. Its energy is half
-that of two balls.
+A flat face of iron of high permeability is a mirror: a ball near it interacts with its image, a ball of the mirrored
+multipoles with charges of the opposite sign. A dipole m becomes 2 (n·m) n − m, with the normal n. The cells of the iron
+respond to the ball's moment only. So the image takes part in the near-contact model as a near ball of its own ball. It
+adds the higher multipoles and the flux through a contact. Its energy is half that of two balls.
 
-* **Faces** are flat and convex. The weight of an image is a product over the edges of the face: it rises from 0 to 1 at
-  distances up to ``EDGE`` from each edge to the point below the ball. Its gradient is a force along the face.
+* **Faces** are flat and convex. The weight of an image is a product over the edges of the face. It rises from 0 to 1 as
+  the point below the ball moves from the edge to a distance of ``EDGE``. Its gradient is a force along the face.
 * **Permeability.** Sources of an image are scaled by (μ − 1)/(μ + 1). μ is the differential permeability of the cells,
   averaged around the point below the ball, so that images fade as the iron saturates.
 * **Reaction.** The iron feels the opposite force, at the ball's center, and the opposite torque. So forces and torques
@@ -28,7 +27,7 @@ from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.wrench import MU0
 
 IMAGES = 3  # largest number of images of a ball
-EDGE = 0.6  # distance from an edge of a face [radii of the ball] at which an image has its full weight
+EDGE = 0.3  # distance from an edge of a face [radii of the ball] at which an image has its full weight
 DEEPEST_CENTER = 0.3  # height of a ball's center over a face [radii] below which it has no image
 VIEW_ROWS = 8  # numbers of an image's view; as in ``images.h``
 
@@ -46,7 +45,7 @@ class IronFaces:
     edges: tuple[np.ndarray, ...]  # of each face: outward unit normals in its plane and their offsets [m], shape [e, 4]
 
 
-def constants(images: bool) -> dict[str, int | float]:
+def image_constants(images: bool) -> dict[str, int | float]:
     """Return the constants of ``images.h``; ``images`` is True if balls have images."""
     return dict(IMAGES=IMAGES if images else 0, EDGE=EDGE, DEEPEST_CENTER=DEEPEST_CENTER, VIEW_ROWS=VIEW_ROWS)
 

@@ -68,7 +68,7 @@ def _constants(with_images: bool) -> dict[str, int | float]:
     fades = {name: getattr(contact_table, name) for name in ("MOST_SHARED", "LEAST_RATIO", "CONTACT_GAP", "DEEPEST")}
     fades["QUADRUPOLE_GAP"] = [distance - 2.0 for distance in contact_table.QUADRUPOLE_REACH]
     fades["QUADRUPOLE_OVERLAP"] = contact_table.QUADRUPOLE_OVERLAP
-    return _ROWS | nonuniform.constants() | images.constants(with_images) | dict(
+    return _ROWS | nonuniform.constants() | images.image_constants(with_images) | dict(
         GROUP=GROUP, CANDIDATES=CANDIDATES, NEAR_SLOTS=NEAR_SLOTS, CONTACT_SLOTS=CONTACT_SLOTS, SWEEPS=SWEEPS,
         MARGIN=MARGIN, HALF_RANGE=0.5 * contact_table.RANGE, HALF_REACH=0.5 * contact_table.REACH,
         SMALLEST_GAP=contact_table.SMALLEST_GAP, SOFTNESS=contact_table.SOFTNESS, NODES=nodes, FIRST_NODE=first,
@@ -137,10 +137,8 @@ def contact_arrays(dtype) -> Any:
         pair_forces: wp.array4d[dtype]  # forces of contacts by the own half of ΔC [chunks + 1, slots, 3, CHUNK]
         forces: wp.array[vec3]  # [N] [n]
         torques: wp.array[vec3]  # [N·m] [n]
-        # Permanent moments:
-        magnets: nonuniform.magnet_arrays(dtype)
-        # Flat faces of iron:
-        faces: images.face_arrays(dtype)
+        magnets: nonuniform.magnet_arrays(dtype)  # permanent moments
+        faces: images.face_arrays(dtype)  # flat faces of iron
 
     return ContactArrays
 

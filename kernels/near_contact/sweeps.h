@@ -215,8 +215,7 @@ CUDA_CALLABLE inline void relax(const NearArrays& a, int i) {
 // Writes moments to the lines of sources, and the images' lines.
 CUDA_CALLABLE inline void store_moment(const NearArrays& a, int i) {
     const Vector m = a.own_moment(i);
-    if (share() == 0)
-        put_four(a.sources, 2, i, {numbers(rows_at(a.state, STATE_ROWS, i) + 13 * CHUNK), m.x, m.y, m.z});
+    if (share() == 0) put_four(a.sources, 2, i, {numbers(rows_at(a.state, STATE_ROWS, i) + 13 * CHUNK), m.x, m.y, m.z});
     store_responses(a, i);
     mirror_sources(a, i);
 }

@@ -11,6 +11,8 @@ _LEAST_AREA = 0.01
 """Smallest area of a face, relative to the whole surface of its mesh: smaller facets are parts of curved surfaces."""
 _FLAT = 1e-5
 """Largest distance of a point from the plane of its face, or from the line of an edge, relative to the mesh."""
+_SAME_LINE = 1e-4
+"""Difference of normals, and of offsets relative to the face, up to which edges are in one line."""
 
 
 @dataclass(frozen=True)
@@ -96,5 +98,6 @@ def _edges(corners: np.ndarray, normal: np.ndarray) -> np.ndarray:
     outward = np.cross(along, normal)
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     offsets = (outward * corners).sum(axis=1)
-    _, kept = np.unique(np.rint(np.column_stack([outward, offsets / np.ptp(corners)]) / 1e-4), axis=0, return_index=True)
+    lines = np.column_stack([outward, offsets / np.ptp(corners)])
+    _, kept = np.unique(np.rint(lines / _SAME_LINE), axis=0, return_index=True)
     return np.column_stack([outward, offsets])[np.sort(kept)]  # edges in one line count once

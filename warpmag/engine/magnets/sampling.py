@@ -130,7 +130,7 @@ class ShapeSampler:
             surface = polyhedra.cylinder(scale[0], scale[1]).posed(solid.position, solid.rotation)
             return faces_of_polyhedron(surface, 2)
         if kind in (kinds.MESH, kinds.CONVEX_MESH):
-            source = self._sources[shape]
+            source: Any = self._sources[shape]
             vertices = solid.to_body(np.asarray(source.vertices, float) * scale)
             return faces_of_mesh(vertices, np.asarray(source.indices).reshape(-1, 3))
         return joined([])
