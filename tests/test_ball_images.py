@@ -30,8 +30,8 @@ class BallsOnPlate:
         count = len(self.centers)
         self.system = moment_system(
             radii=np.append(PLATE.radii, np.full(count, R)), bodies=np.append(np.zeros(N, int), 1 + np.arange(count)),
-            couplings=[(0, coupling)], faces=[iron_faces], susceptibility=susceptibility, contact_model="multipole",
-            external_field=self.field, device=device, **{**FAINT, **settings},
+            couplings=[(0, coupling)], susceptibility=susceptibility, external_field=self.field, device=device,
+            **{**FAINT, "contact_model": "multipole", "faces": [iron_faces], **settings},
         )  # fmt: skip
 
     def energy(self, shifts=0.0, turn=None, turned_plate=None):
