@@ -117,7 +117,7 @@ def test_images_fade_as_the_iron_saturates(device):
     magnetizations = balls.system.moments.numpy()[:N] / PLATE.volumes[:, None]
     chi = 50.0 * (1.0 - (np.linalg.norm(magnetizations, axis=1) / saturation) ** 2)
     distances = np.linalg.norm(PLATE.positions - [0.001, 0.002, HALF[2]], axis=1)
-    weights = PLATE.volumes / (1.0 + (distances / R) ** 2) ** 3
+    weights = PLATE.volumes * np.maximum(1.0 - (distances / (3.0 * R + 2.0 * PLATE.radii)) ** 2, 0.0) ** 2
     response = balls.system._near.arrays.faces.view.numpy()[0, N, 7]
     assert response == pytest.approx(np.average(chi / (chi + 2.0), weights=weights), rel=1e-6)
     assert 0.1 < response < 0.9

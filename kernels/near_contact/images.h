@@ -85,28 +85,30 @@ CUDA_CALLABLE inline void find_images(const NearArrays& a, int i) {
     }
 }
 
-// Mean response (μ − 1)/(μ + 1) of the cells of a body around a point, from their differential permeability.
+// Mean response (μ − 1)/(μ + 1) of the cells of a body around a point, from their differential permeability. Cells
+// count up to three radii of the ball and two of their own.
 CUDA_CALLABLE inline Real iron_response(const NearArrays& a, int body, Point3 foot, Real radius) {
     const size_t stride = a.moment_stride;
     const int first = a.face_cells[3 * body + 1], end = a.face_cells[3 * body + 2];
-    const Number zero = Number(Real(0)), width = zero + 1 / (radius * radius);
+    const Number zero = Number(Real(0));
     Number total = zero, weights = zero;
     for (int c = first; c < end; c += WIDTH) {
         const int count = end - c;
         auto row = [&](int n) { return numbers_or(a.packed + n * stride + c, count, 0); };
         const Vector r = {row(0) - foot.x, row(1) - foot.y, row(2) - foot.z};
-        const Number slope = numbers_or(a.cell_slope + c, count, 1), volume = row(3) * row(3) * row(3);
+        const Number size = row(3), reach = 3 * radius + 2 * size, near = 1 - dot(r, r) / (reach * reach);
+        if (!any(near > zero)) continue;
+        const Number slope = numbers_or(a.cell_slope + c, count, 1), inside = larger(near, zero);
         const Vector reduced = numbers_or(a.cell_inverse_saturation + c, count, 0) * Vector{row(4), row(5), row(6)};
         const Curves curves = curves_of(a.cell_curve, a.common_curve, a.curve_tables, slope, c, count);
         const Number steep = slope * curve_steepness(dot(reduced, reduced), curves);
-        const Number k = smaller(larger(steep, zero), zero + 3), near = 1 / (1 + width * dot(r, r));
-        const Number weight = volume * near * near * near;
+        const Number k = smaller(larger(steep, zero), zero + 3), weight = size * size * size * inside * inside;
         weights += weight;
         total += weight * k / (2 + Real(1.0 / 3.0) * k);
     }
     Real sum = 0, sum_of_weights = 0;
     for (int l = 0; l < WIDTH; ++l) sum += lane_of(total, l), sum_of_weights += lane_of(weights, l);
-    return sum / sum_of_weights;
+    return sum_of_weights > 0 ? sum / sum_of_weights : Real(0);
 }
 
 // Calls visit(image, ball) for the images of balls i; the threads of a group take turns.

@@ -122,10 +122,11 @@ def _reaction_kernel(dtype):
         forces: wp.array[vec3],
         torques: wp.array[vec3],
     ):
-        body = wp.tid()
+        row = wp.tid()
+        body = ranges[row, 0]
         first = faces.cells[body, 1]
         x, force, torque = row3(packed, 0, first), vec3(), vec3()
-        for ball in range(ranges[body, 0], ranges[body, 1]):
+        for ball in range(ranges[row, 1], ranges[row, 2]):
             for k in range(IMAGES):
                 f = faces.image_face[k, ball]
                 if f >= 0:
@@ -146,7 +147,7 @@ class ImageReactions:
 
     Args:
         faces: Arrays of the faces (:func:`face_arrays`).
-        ranges: First moment in the world of each body and index after the last one, shape [bodies, 2].
+        ranges: Index of each movable body, first moment of its world and index after the last one, shape [bodies, 3].
         packed: All moments, packed (``pairs.packing``).
         forces, torques: Forces [N] and torques [N·m] to add to, Warp arrays, shape [n].
     """
@@ -154,12 +155,13 @@ class ImageReactions:
     def __init__(self, faces, ranges, packed, forces, torques):
         """Record the launch."""
         dtype, device = packed.dtype, packed.device
-        ranges = wp.array(np.asarray(ranges, np.int32), dtype=wp.int32, device=device)
+        ranges = wp.array(np.reshape(ranges, (-1, 3)).astype(np.int32), dtype=wp.int32, device=device)
         inputs = [faces, ranges, packed.packed, dtype(MU0 * INVERSE_4PI), forces, torques]
         self._launch = wp.launch(
-            _reaction_kernel(dtype), dim=len(ranges), inputs=inputs, device=device, record_cmd=True
+            _reaction_kernel(dtype), dim=ranges.shape[0], inputs=inputs, device=device, record_cmd=True
         )
 
     def add(self):
         """Add the reactions to the forces and torques of the bodies' first cells."""
-        self._launch.launch()
+        if self._launch is not None:  # Warp records none if no body moves
+            self._launch.launch()

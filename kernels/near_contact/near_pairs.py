@@ -218,8 +218,8 @@ def allocate(
     _set_materials(a, radii, eligible, susceptibility, material, padded)
     _set_pairs(a, balls, images.IMAGES if faces else 0, dtype, device)
     a.faces = images.allocate(balls, faces, rotations, worlds, radii, material, dtype=dtype, device=device)
-    of_bodies = [ranges[body.world][::2] for body in faces]
-    reactions = images.ImageReactions(a.faces, of_bodies, packed, forces, torques) if faces else None
+    moving = [(k, *ranges[body.world][::2]) for k, body in enumerate(faces) if movable[body.first]]
+    reactions = images.ImageReactions(a.faces, moving, packed, forces, torques) if faces else None
     pairs, a.magnets = nonuniform.allocate(
         balls, ranges, eligible, magnets, single, movable, dtype=dtype, device=device, expansion=expansion
     )

@@ -310,7 +310,7 @@ class MomentSystem:
         }
 
     def _make_near_contacts(self, layout: MomentLayout, rotatable, susceptibility, faces):
-        magnets = layout.permanent | (self.material.curve.numpy() == LINEAR)
+        magnets, worlds = layout.permanent | (self.material.curve.numpy() == LINEAR), {*layout.worlds[layout.balls]}
         for solid in () if self.sources is None else self.sources.solids:  # closed forms replace their moments
             magnets[solid.first : solid.first + solid.count] = solid.response > 0.0
         return near_pairs.allocate(
@@ -318,7 +318,7 @@ class MomentSystem:
             ranges=self.world_ranges, magnets=magnets, single=layout.single, field=self._inducible_field,
             movable=layout.movable, rotatable=rotatable, forces=self.forces, torques=self.torques,
             expansion=None if self.source_interaction is None else self.source_interaction.expansion,
-            faces=[body for body in faces if layout.balls[layout.worlds == body.world].any()],
+            faces=[body for body in faces if body.world in worlds],
             rotations=self.rotations,
         )  # fmt: skip
 

@@ -87,8 +87,8 @@ class Magnetics:
             force: Force law, ``kelvin`` (Eqs. 13, 14) or ``zeeman`` (Eq. 4).
             dynamics: ``theta`` (exact flow, accelerated), ``theta-euler`` (the paper's explicit step), ``llg`` or
                 ``llg-damping`` (Eq. 6, with and without precession).
-            contact_model: ``dipole``, or ``multipole``, which adds higher multipoles of balls that nearly touch each other or
-                flat faces of iron.
+            contact_model: ``dipole``, or ``multipole``, which adds higher multipoles of balls that nearly touch each
+                other or flat faces of iron.
             method: Summation of fields and forces: ``direct`` over all pairs, ``fmm`` by the fast multipole method
                 with an error within ``rtol``, or ``auto`` for the faster one.
             rtol: Relative magnetization error at which the induction solve ends.
