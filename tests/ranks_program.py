@@ -90,7 +90,7 @@ def differ() -> None:
         "permanent": lambda: warpmag.solve_induction(x, 0.1, saturation=1e6, permanent=(x + 2, x + rank), device="cpu"),
         "Magnetics": lambda: warpmag.Magnetics(model),
         "rtol": lambda: warpmag.Magnetics(small_scene().finalize(device="cpu"), rtol=1e-3 * (1 + rank)),
-        "Simulation": lambda: warpmag.Simulation(small_scene(), step=1e-3 * (1 + rank), device="cpu"),
+        "Simulation": lambda: warpmag.Simulation(small_scene(), dt=1e-3 * (1 + rank), device="cpu"),
         "one only": lambda: warpmag.Simulation("no.usda" if rank else small_scene(), device="cpu"),
         "on_first_rank": lambda: on_first_rank(lambda: 1 // 0, current_ranks()),
         "sweep": lambda: warpmag.sweep(lambda worlds: 1 // (1 - worlds[0]), 4, together=1),

@@ -71,7 +71,7 @@ def told(path, folder, device, capsys, frames=2):
     lines = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
     checked = {kind: [rest for name, rest in lines if name == kind] for kind in ("error", "warning")}
     command = ["run", str(path), "-o", str(folder / "out.usda"), "--frames", str(frames), "--device", device]
-    assert cli.main(command) == code
+    assert cli.main([*command, "--overwrite"]) == code
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warpmag: ")]
     ran = [line.removeprefix("warpmag: warning: ") for line in lines if line.startswith("warpmag: warning: ")]
     refused = [line.removeprefix("warpmag: ") for line in lines if not line.startswith("warpmag: warning: ")]

@@ -1,18 +1,22 @@
 """The command: what it prints, what it writes, how it ends."""
 
 import os
+import re
+import shlex
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from importlib import metadata
+from types import SimpleNamespace
 
 import pytest
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
 from warpmag import cli
 from warpmag.declarations.magnets import Magnet, MagneticSettings
+from warpmag.declarations.materials import MATERIALS
 from warpmag.scenes_usd import balls_up
 from warpmag.usd import author_magnet, author_settings
 
@@ -38,8 +42,9 @@ def test_run_writes_a_stage_and_a_summary(scene, device, tmp_path, capfd):
     out = tmp_path / "new" / "out.usda"
     assert cli.main(["run", str(scene), "-o", str(out), "--frames", "3", "--device", device]) == 0
     printed = capfd.readouterr()
-    for word in ("4 moving", "Ti ", "Tf ", "Tr ", "evaluations per step", "error", "RMS", "peak", "penetration"):
+    for word in ("4 moving", "RMS", "peak", "penetration", "wall time", "loading"):
         assert word in printed.out
+    assert "Ti " not in printed.out  # only with --verbose
     assert "3/3" in printed.err  # the progress bar
     assert "Warp" not in printed.out + printed.err
     stage = Usd.Stage.Open(str(out))
@@ -68,23 +73,113 @@ def test_version(capsys):
 def test_presets_run_by_name(scene, device, preset, tmp_path, capfd):
     out = tmp_path / "out.usda"
     command = ["run", str(scene), "-o", str(out), "--frames", "1", "--device", device, "--preset", preset]
-    assert cli.main(command) == 0
-    assert "magnetization error" in capfd.readouterr().out
+    assert cli.main([*command, "--verbose"]) == 0
+    printed = capfd.readouterr().out
+    for word in ("Ti ", "Tf ", "Tr ", "evaluations per step", "magnetization error", "buffer growths"):
+        assert word in printed
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "parsed"),
+    ("command", "old", "new", "stored"),
     [
-        (["--sums", "fmm"], "--method fmm", (None, "fmm")),
-        (["--method", "paper"], "--preset paper", ("paper", "auto")),
+        ("run", "--sums fmm", "--method fmm", {"preset": None, "method": "fmm"}),
+        ("run", "--method paper", "--preset paper", {"preset": "paper", "method": "auto"}),
+        ("render -o a.png", "--moments", "--arrows", {"arrows": True}),
+        ("export -o a.usdc", "--rate 30.0", "--fps 30.0", {"fps": 30.0}),
     ],
 )
-def test_renamed_options_still_work_with_a_warning(old, new, parsed, monkeypatch, capsys):
+def test_renamed_options_still_work_with_a_warning(command, old, new, stored, monkeypatch, capsys):
     options = []
-    monkeypatch.setattr(cli, "_run", lambda given: options.append(given) or 0)
-    assert cli.main(["run", "balls_up", *old]) == 0
-    assert (options[0].preset, options[0].method) == parsed
-    assert capsys.readouterr().err == f"warpmag: warning: {' '.join(old)} is deprecated, write {new}\n"
+    for name in ("_run", "_render", "_export"):
+        monkeypatch.setattr(cli, name, lambda given: options.append(given) or 0)
+    for spelling, warning in ((old, f"warpmag: warning: {old} is deprecated, write {new}\n"), (new, "")):
+        assert cli.main([*command.split(), "balls_up", *spelling.split()]) == 0
+        given = vars(options.pop())
+        assert {name: given[name] for name in stored} == stored
+        assert capsys.readouterr().err == warning
+
+
+def test_an_existing_result_is_not_overwritten(scene, device, tmp_path, capsys):
+    """The run of hours was replaced without a word."""
+    out = tmp_path / "out.usda"
+    out.write_text("a result")
+    command = ["run", str(scene), "-o", str(out), "--frames", "1", "--device", device]
+    check_refused(command, f"{out}: exists; give --overwrite, --resume to continue that run, or another -o", capsys)
+    assert out.read_text() == "a result"
+    assert cli.main([*command, "--overwrite"]) == 0
+    assert Usd.Stage.Open(str(out)).GetEndTimeCode() == pytest.approx(1.0, abs=0.03)  # at the nearest step
+
+
+def test_step_duration_and_field_reach_the_simulation(scene, tmp_path, monkeypatch):
+    """A field that begins with a minus and has an exponent is no option."""
+    loaded = {}
+
+    def load(_, **settings):
+        loaded.update(settings)
+        return SimpleNamespace(model=None, magnetics=None, frame_rate=60.0, frames_of=lambda frames: frames)
+
+    frames = []
+    monkeypatch.setattr(cli, "_load", load)
+    monkeypatch.setattr(cli, "_simulate", lambda s, _, options, *__, **___: frames.append(cli._frames_of(s, options)))
+    command = ["run", str(scene), "-o", str(tmp_path / "out.usda"), "--duration", "0.25", "--step", "5e-4"]
+    assert cli.main([*command, "--external-field", "-8e4", "0", "-.5"]) == 0
+    assert (loaded["dt"], loaded["external_field"], frames) == (5e-4, [-8e4, 0.0, -0.5], [15])
+
+
+def test_the_wall_time_is_the_stopwatch_s(scene, device, tmp_path):
+    """Whole and sum of the parts to 5 %, and to the 0.05 s of rounding and 0.2 s in which a busy machine starts."""
+    command = [sys.executable, "-m", "warpmag.cli", "run", str(scene), "-o", str(tmp_path / "out.usda")]
+    began = time.perf_counter()
+    done = subprocess.run([*command, "--frames", "2", "--device", device], capture_output=True, text=True, check=True)
+    whole = time.perf_counter() - began
+    (line,) = (line for line in done.stdout.splitlines() if line.startswith("wall time"))
+    total, *parts = map(float, re.findall(r"([\d.]+) s", line))
+    assert total == pytest.approx(whole, rel=0.05, abs=0.25)
+    assert sum(parts) == pytest.approx(total, abs=0.05 * (len(parts) + 2))  # at most two parts are too short to show
+
+
+COMPILE = """
+import time, warp as wp
+from warpmag.kernel_loading import kernel_seconds, watch_kernels
+wp.config.log_level = wp.LOG_ERROR
+watch_kernels(lambda: print("compiling", flush=True))
+@wp.kernel
+def fill(values: wp.array[float]):
+    values[wp.tid()] = 1.0
+values = wp.zeros(1, dtype=float, device="cpu")
+began = time.perf_counter()
+for _ in range(2):
+    wp.launch(fill, dim=1, inputs=[values], device="cpu")
+print(0.0 < kernel_seconds() < time.perf_counter() - began)
+"""
+
+
+def test_a_compilation_is_announced_before_it_begins(tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text(COMPILE)
+    for cached in (False, True):
+        environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
+        run = subprocess.run([sys.executable, program], env=environment, capture_output=True, text=True, check=True)
+        assert run.stdout.split() == [*["compiling"] * (not cached), "True"]
+
+
+def test_examples_of_every_help_are_understood():
+    parser = cli._parser()
+    (commands,) = (action.choices for action in parser._subparsers._group_actions)
+    assert set(commands) == {"run", "scenes", "materials", "check", "render", "export"}
+    for name, command in {"warpmag": parser, **commands}.items():
+        examples = re.findall(r"^  warpmag (.*?)(?:   .*)?$", command.format_help().partition("examples:")[2], re.M)
+        assert examples, name
+        for example in examples:
+            parser.parse_args(shlex.split(example))
+
+
+def test_materials_lists_every_material(capsys):
+    assert cli.main(["materials"]) == 0
+    lines = capsys.readouterr().out.splitlines()[1:]
+    assert [line.split()[0] for line in lines] == list(MATERIALS)
+    (line,) = (line for line in lines if line.startswith("N42"))
+    assert "remanence 1.3 T" in line and "7500 kg/m³" in line
 
 
 def test_a_run_repeats(scene, device, tmp_path, capfd):
@@ -102,7 +197,7 @@ def test_a_run_repeats(scene, device, tmp_path, capfd):
 
 def test_contact_model_by_option_and_by_stage(scene, device, tmp_path, capsys):
     out = str(tmp_path / "out.usda")
-    command = ["run", "-o", out, "--frames", "1", "--device", device]
+    command = ["run", "-o", out, "--overwrite", "--frames", "1", "--device", device]
     assert cli.main([*command, str(scene), "--contact-model", "multipole"]) == 0
 
     def choose(stage):
@@ -126,6 +221,7 @@ def test_check_tells_what_a_stage_holds(scene, capsys):
     printed = capsys.readouterr().out
     assert "4 inducible, 1 permanent" in printed
     assert "1 m, 1 kg, Z up" in printed
+    assert printed.splitlines()[-1] == "verdict     ready to run"
 
 
 def set_on_ball(name, value):
@@ -290,3 +386,16 @@ def test_without_a_usable_cache_kernels_are_compiled_for_one_command(where):
     assert result.stdout == "True\n"
     (line,) = result.stderr.splitlines()
     assert line.startswith("warpmag: warning: kernels are compiled for this command only")
+
+
+def test_check_ends_with_a_verdict(scene, tmp_path, capsys):
+    def press(stage):
+        place = stage.GetPrimAtPath("/World/Balls/Ball_0000").GetAttribute("xformOp:translate")
+        place.Set(place.Get() + Gf.Vec3d(0.0005, 0.0, 0.0))
+
+    for edit, code, verdict in (
+        (set_on_ball("warpmag:saturationMagnetization", -1.0), cli.BAD_INPUT, "cannot be run: 1 error"),
+        (press, 0, "ready to run, with 1 warning"),
+    ):
+        assert cli.main(["check", str(edited(scene, tmp_path / "edited.usda", edit))]) == code
+        assert capsys.readouterr().out.splitlines()[-1] == f"verdict     {verdict}"

@@ -105,7 +105,7 @@ def test_momentum_of_a_coil_and_a_ball_is_kept_in_a_run(device):
     coil = builder.add_body(mass=0.02, inertia=wp.mat33(*(2e-6 * np.eye(3)).ravel().tolist()), label="coil")
     warpmag.add_coil(builder, body=coil, shape="solenoid", radius=A, length=2.0 * HALF, ampere_turns=4000.0)
     ball = add_ball(builder, (0.003, 0.0, 0.05))
-    simulation = warpmag.Simulation(builder, step=1e-3, device=device)
+    simulation = warpmag.Simulation(builder, dt=1e-3, device=device)
     mass, start = simulation.model.body_mass.numpy().astype(float), simulation.state.body_q.numpy()[:, :3].astype(float)
     for _ in range(60):
         simulation.step()
@@ -155,7 +155,7 @@ def test_fixed_bodies_and_fixed_maps(device):
     builder = new_builder()
     builder.replicate(world, 2)
     values = np.broadcast_to([30.0, 0.0, 0.0], (2, 2, 2, 3))
-    warpmag.add_field_map(builder, (-1.0, -1.0, -1.0), 2.0, values, label="earth")
+    warpmag.add_field_map(builder, origin=(-1.0, -1.0, -1.0), spacing=2.0, values=values, label="earth")
     model = builder.finalize(device=device)
     magnetics, state = warpmag.Magnetics(model), model.state()
     magnetics.apply(state)

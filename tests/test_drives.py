@@ -95,7 +95,7 @@ def test_a_bar_hinged_at_its_end_swings_as_a_pendulum(solver, device):
     axis = np.array((0.0, 1.0, 0.0))
     bar, inertia = hinge(builder, center - wide, arm=EXTENT[0])
     rate, steps = math.sqrt(builder.body_mass[bar] * G * EXTENT[0] / inertia), 220
-    simulation = Simulation(builder, solver=solver, device=device, step=STEP)
+    simulation = Simulation(builder, solver=solver, device=device, dt=STEP)
     compare(angles(simulation, bar, axis, steps), swing(rate, center - wide, center, steps), center, wide)
 
 
@@ -105,7 +105,7 @@ def test_a_compass_needle_swings_about_north(solver, device):
     needle, inertia = hinge(builder, wide, axis=tuple(axis))
     warpmag.add_permanent(builder, body=needle, magnetization=(4e5, 0.0, 0.0))
     moment = 4e5 * 8.0 * EXTENT.prod()
-    simulation = Simulation(builder, solver=solver, device=device, step=STEP, external_field=(field, 0.0, 0.0))
+    simulation = Simulation(builder, solver=solver, device=device, dt=STEP, external_field=(field, 0.0, 0.0))
     rate, steps = math.sqrt(MU0 * moment * field / inertia), 220
     compare(angles(simulation, needle, axis, steps), swing(rate, wide, 0.0, steps), 0.0, wide)
 
@@ -114,7 +114,7 @@ def test_a_joint_outside_of_its_limits_goes_back_slowly(device):
     """As those of robots whose stages say where joints may be, and not where they start: no jump in one substep."""
     builder = scene()
     bar, _ = hinge(builder, 0.0, limit_lower=0.5, limit_upper=1.5)
-    simulation = Simulation(builder, device=device, step=STEP)
+    simulation = Simulation(builder, device=device, dt=STEP)
     path = angles(simulation, bar, (0.0, 1.0, 0.0), 300)
     assert np.diff(path).max() < 1.05 * 10.0 * STEP  # rad, _RETURN_RATE of kernels.contacts.joints
     assert path[100] > 0.499 and path[100:].min() > 0.499 and path.max() < 1.501
@@ -125,7 +125,7 @@ def test_ends_of_a_joint_that_are_apart_close_slowly(device):
     builder = scene()
     bar, _ = hinge(builder, 0.0, arm=EXTENT[0])
     builder.body_q[bar] = wp.transform((0.3, 0.0, 0.2), wp.quat_identity())
-    simulation = Simulation(builder, device=device, step=STEP)
+    simulation = Simulation(builder, device=device, dt=STEP)
     gap = math.hypot(0.3 - EXTENT[0], 0.2)
     (told,) = simulation.warnings()
     assert told.startswith(f"{builder.joint_label[-1]}: its ends are {gap:.3g} m apart at the start")
@@ -175,7 +175,7 @@ def test_a_drive_is_a_spring_of_its_gain(solver, device):
     bar, inertia = hinge(builder, wide, arm=EXTENT[0], axis=tuple(axis))
     builder.joint_target_ke[-1], builder.joint_target_kd[-1] = inertia * rate**2, 0.0
     builder.joint_target_mode[-1] = int(newton.JointTargetMode.POSITION)
-    simulation = Simulation(builder, solver=solver, device=device, step=STEP)
+    simulation = Simulation(builder, solver=solver, device=device, dt=STEP)
     expected = swing(rate, wide, 0.0, steps, law=float)
     if solver == "steel":  # its springs are implicit, which damps them in substeps of half a step
         expected *= np.exp(-0.5 * rate**2 * 0.5 * STEP * STEP * np.arange(steps + 1))
@@ -194,7 +194,7 @@ def servo(angle=0.0, rate=200.0):
 @pytest.mark.parametrize("solver", DRIVEN, indirect=True)
 def test_an_arm_holds_what_its_drive_holds(solver, device):
     builder, bar, sag = servo()
-    path = angles(Simulation(builder, solver=solver, device=device, step=STEP), bar, np.array((0.0, 1.0, 0.0)), 80)
+    path = angles(Simulation(builder, solver=solver, device=device, dt=STEP), bar, np.array((0.0, 1.0, 0.0)), 80)
     if solver == "kamino":  # stiffer than its gain, as it says
         assert 0.0 < path[-1] < sag
     else:
@@ -240,7 +240,7 @@ def test_a_stages_drive_holds_its_target(solver, device, tmp_path):
     if solver == "mujoco":
         pytest.importorskip("mujoco_warp")
     (tmp_path / "arm.usda").write_text(ARM)
-    simulation = Simulation(tmp_path / "arm.usda", solver=solver, device=device, step=STEP)
+    simulation = Simulation(tmp_path / "arm.usda", solver=solver, device=device, dt=STEP)
     angle = angles(simulation, 0, np.array((0.0, 1.0, 0.0)), 150)[-1]
     stiffness, target = math.degrees(0.002), math.radians(10.0)  # N·m/rad
     sag = 0.01 * G * 0.01 * math.cos(target) / stiffness
@@ -253,7 +253,7 @@ def test_a_stages_drive_holds_its_target(solver, device, tmp_path):
 def test_targets_may_change_between_steps(device):
     builder, bar, sag = servo()
     axis = np.array((0.0, 1.0, 0.0))
-    simulation = Simulation(builder, device=device, step=STEP)
+    simulation = Simulation(builder, device=device, dt=STEP)
     before = angles(simulation, bar, axis, 80)[-1]
     simulation.control.joint_target_q.assign(np.array([-0.5], np.float32))
     raised = angles(simulation, bar, axis, 80)[-1]
@@ -284,7 +284,7 @@ def test_a_drive_along_a_slanted_axis(device):
     builder.add_shape_sphere(ball, radius=5e-3)
     builder.add_articulation([builder.add_joint_prismatic(-1, ball, axis=tuple(axis))])
     builder.joint_target_ke[-1], builder.joint_target_mode[-1] = builder.body_mass[ball] * rate**2, 1
-    simulation = Simulation(builder, device=device, step=STEP)
+    simulation = Simulation(builder, device=device, dt=STEP)
     path = []
     for _ in range(steps):
         simulation.step()
@@ -309,7 +309,7 @@ def weakly_pulled(other):
 @pytest.mark.parametrize("other", ["joint", "particle"])
 def test_a_weak_pull_moves_a_body_from_rest(other, device):
     builder, ball = weakly_pulled(other)
-    simulation = Simulation(builder, device=device, step=STEP)
+    simulation = Simulation(builder, device=device, dt=STEP)
     for _ in range(150):
         simulation.step()
     fallen = -simulation.state.body_q.numpy()[ball, 2]

@@ -164,8 +164,8 @@ def _flying_ball(device, saturation, susceptibility, velocity):
     warpmag.add_inducible(builder, body=body, saturation=saturation, susceptibility=susceptibility, conductivity=5.96e7)
     nodes = np.linspace(-0.1, 0.1, 5)
     values = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), axis=-1) * GRADIENT
-    warpmag.add_field_map(builder, (-0.1,) * 3, 0.05, values)
-    return warpmag.Simulation(builder, step=1e-3, device=device)
+    warpmag.add_field_map(builder, origin=(-0.1,) * 3, spacing=0.05, values=values)
+    return warpmag.Simulation(builder, dt=1e-3, device=device)
 
 
 def _slowed_down(velocity, mass, steps, dt):
@@ -325,7 +325,7 @@ def test_a_ball_that_hangs_stops_to_swing(device):
     ball = builder.add_body(xform=wp.transform((*place[:2], top + place[2]), wp.quat_identity()))
     builder.add_shape_sphere(ball, radius=RADIUS, cfg=smooth)
     warpmag.add_inducible(builder, body=ball, conductivity=1e7)
-    simulation, step, angles = warpmag.Simulation(builder, step=1e-3, device=device), 1e-3, []
+    simulation, step, angles = warpmag.Simulation(builder, dt=1e-3, device=device), 1e-3, []
     for _ in range(500):
         simulation.step()
         x, _, z = simulation.state.body_q.numpy()[0, :3]

@@ -207,7 +207,7 @@ def test_shared_forces_neither_lag_nor_lead(speed, substeps, device):
         magnet = builder.add_shape_sphere(-1, radius=R)
         warpmag.add_permanent(builder, shape=magnet, magnetization=(0.0, 0.0, speed * 1.1e6))
         add_ball(builder, (0.02, 0.0, 0.03), velocity=(0.0, 0.0, -speed))
-        simulation = Simulation(builder, device=device, step=step)
+        simulation = Simulation(builder, device=device, dt=step)
         pose = run(simulation, round(0.06 / speed / step))[0, :3]
         return pose, simulation.statistics
 
@@ -241,7 +241,7 @@ def test_the_step_asked_for_is_the_step_done(device):
     builder = newton.ModelBuilder()
     warpmag.register_attributes(builder)
     add_ball(builder, (0.0, 0.0, 1.0))
-    simulation = Simulation(builder, device=device, step=4e-3)
+    simulation = Simulation(builder, device=device, dt=4e-3)
     fallen = 1.0 - run(simulation, 25)[0, 2]
     assert simulation.time == pytest.approx(0.1)
     # Symplectic Euler with substeps h falls g t (t + h) / 2; substeps are at most 0.5 ms.
@@ -377,8 +377,8 @@ def test_bad_scenes_are_refused(device):
         Simulation(builder, device=device)
     with pytest.raises(warpmag.InputError, match="solver: 'magic' is not one of xpbd, steel"):
         Simulation(pile(), device=device, solver="magic")
-    with pytest.raises(warpmag.InputError, match="step: must be positive"):
-        Simulation(pile(), device=device, step=0.0)
+    with pytest.raises(warpmag.InputError, match="dt: must be positive"):
+        Simulation(pile(), device=device, dt=0.0)
     with pytest.raises(warpmag.InputError, match="device: no 'cuda:99' here"):
         Simulation(pile(), device="cuda:99")
     with pytest.raises(warpmag.InputError, match="only a scene from a stage"):

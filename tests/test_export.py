@@ -32,7 +32,7 @@ KINDS = {
     "plain.usda": {},
     "shaded.usdc": {"color": "speed", "arrows": True},
     "lines.usd": {"color": "magnetization", "field_lines": 5},
-    "pulled.usdz": {"color": "force", "rate": 30.0},
+    "pulled.usdz": {"color": "force", "fps": 30.0},
 }
 
 
@@ -89,7 +89,7 @@ def exported(run, device):
 @pytest.mark.parametrize("name", KINDS)
 def test_the_motion_is_that_of_the_run(name, exported):
     stage = exported[name]
-    rate = KINDS[name].get("rate", 24.0)
+    rate = KINDS[name].get("fps", 24.0)
     assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == rate
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, math.ceil(0.067 * rate - 0.05))
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0 and UsdGeom.GetStageUpAxis(stage) == "Z"
@@ -273,7 +273,7 @@ def test_a_kinematic_body_that_has_not_moved_stays(tmp_path):
         ("out.usda", {}, "would overwrite the exported scene"),
         ("new.png", {}, "a stage must end in"),
         ("new.usda", {"color": "taste"}, "color: 'taste'"),
-        ("new.usda", {"rate": 0.0}, "rate: must be positive"),
+        ("new.usda", {"fps": 0.0}, "fps: must be positive"),
         ("new.usda", {"field_lines": -1}, "field_lines: must be"),
         ("scene.usda/new.usda", {}, "cannot be written"),
     ],
@@ -330,12 +330,12 @@ def test_blender_shows_every_body(name, exported, run, tmp_path):
     assert done.returncode == 0, done.stderr
     seen = json.loads(done.stdout.splitlines()[-1])
     body_q, _, _ = frames()
-    assert seen["range"] == [0, math.ceil(0.067 * KINDS[name].get("rate", 24.0) - 0.05)]
+    assert seen["range"] == [0, math.ceil(0.067 * KINDS[name].get("fps", 24.0) - 0.05)]
     assert seen["unit"] == 1.0 and seen["camera"] and seen["lights"] == 2
     assert seen["without_material"] == []
     times = np.array([0.0, 0.017, 0.033, 0.05, 0.067])
     for name_of_frame, code in zip(("first", "last"), seen["range"], strict=True):
-        at = min(code / KINDS[name].get("rate", 24.0), times[-1])
+        at = min(code / KINDS[name].get("fps", 24.0), times[-1])
         places = np.array(seen[name_of_frame])
         for body in range(len(BODIES)):  # straight between samples
             place = [np.interp(at, times, body_q[:, body, axis]) for axis in range(3)]

@@ -87,7 +87,7 @@ def test_bodies_go_where_usd_composes_them(tmp_path, device, motion, kinematic):
 def test_a_keyed_magnet_drags_a_ball_along_a_circle(tmp_path, device, step):
     """The ball it holds goes round with it, at the speed it is set off with: 1 % of the way is asked for."""
     path = write(tmp_path, cube_on_arm(rotateZ={0: 0, 24: 180}), held_ball(0.065))
-    simulation = Simulation(path, device=device, step=step)
+    simulation = Simulation(path, device=device, dt=step)
     ball = body_of(simulation, "Ball")
     for _ in range(round(0.5 / step)):
         simulation.step()

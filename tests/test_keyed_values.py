@@ -117,7 +117,7 @@ def test_substeps_that_are_shortened_follow_the_same_keys(tmp_path, device):
         held_ball(0).replace("Ball", f"Ball{k}").replace("(0, 0, 0)", f"({0.006 * k - 0.009}, {0.011 * (k % 2)}, 0.04)")
         for k in range(4)
     ]
-    simulation = Simulation(write(tmp_path, cube, *balls, gravity=G), device=device, step=2e-3)
+    simulation = Simulation(write(tmp_path, cube, *balls, gravity=G), device=device, dt=2e-3)
     body = body_of(simulation, "Magnet")
     for _ in range(60):
         simulation.step()

@@ -96,7 +96,7 @@ def test_films_last_as_long_as_their_frames(run, device, tmp_path, suffix):
 
 def test_arrows_stand_on_magnets(run, device, tmp_path):
     """The cube's moment points up: the cone on top of it is above the row where the cube ends."""
-    plain, shown = (drawn(run, tmp_path / f"{m}.png", device, moments=m) for m in (False, True))
+    plain, shown = (drawn(run, tmp_path / f"{m}.png", device, arrows=m) for m in (False, True))
     (top, _), other = rows_of(plain, red), np.abs(shown - plain).max(axis=2) > 0.05
     assert other[: int(top * len(plain))].any()
 
@@ -140,5 +140,5 @@ def test_bad_input_is_one_line(stage, tmp_path, capsys):
     with pytest.raises(InputError, match="size: must be 1 to 16384, got 0 x 540"):
         render(stage, tmp_path / "a.png", size=(0, 540))
     with pytest.raises(InputError, match="holds no moments to show"):
-        render(stage, tmp_path / "a.png", moments=True)
+        render(stage, tmp_path / "a.png", arrows=True)
     assert not list(tmp_path.glob("*.png"))

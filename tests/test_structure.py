@@ -41,11 +41,15 @@ OWNERS = {
     "newton._src": ("warpmag/engine/pile_xpbd",),
     "warp._src": ("warpmag/engine/pile_xpbd",),
     "pxr": ("warpmag/usd", "warpmag/show"),
-    "warp": ("warpmag/moments", "warpmag/engine", "warpmag/show", "warpmag/examples", "warpmag/terminal.py"),
+    "warp": (
+        *("warpmag/moments", "warpmag/engine", "warpmag/show", "warpmag/examples"),
+        *("warpmag/terminal.py", "warpmag/kernel_loading.py"),
+    ),
     "bench": (),
     "tests": (),
 }
-"""Folders and modules of ``warpmag/`` that may import a library; the terminal keeps Warp quiet for the command."""
+"""Folders and modules of ``warpmag/`` that may import a library; for the command, the terminal keeps Warp
+quiet and the loading of kernels is timed."""
 OPENINGS = re.compile(r"(What|How|Whether|Where|Those|Of|That|Which|Who)\b")
 """First words of a docstring that hide its subject."""
 BRITISH = re.compile(
@@ -363,3 +367,14 @@ def test_moved_modules_import_by_their_earlier_names():
             module = import_module(earlier)
         names = [name for name in vars(import_module(present)) if not name.startswith("_")]
         assert names and all(getattr(module, name) is getattr(import_module(present), name) for name in names)
+
+
+def test_an_earlier_module_does_not_hide_the_function_of_its_name():
+    sys.modules.pop("warpmag.export", None)
+    with pytest.warns(DeprecationWarning, match="warpmag.export is now warpmag.show.export"):
+        import_module("warpmag.export")
+    try:
+        with pytest.raises(warpmag.InputError, match="fps: must be positive"):
+            warpmag.export("no.usda", "out.usdc", fps=0.0)
+    finally:
+        vars(warpmag).pop("export")

@@ -128,7 +128,7 @@ def test_a_current_follows_its_time_samples(tmp_path, device):
     )
     path = write(tmp_path, pulse)
     path.write_text(path.read_text().replace("metersPerUnit", "timeCodesPerSecond = 2400\n    metersPerUnit"))
-    simulation = warpmag.Simulation(path, device=device, step=1e-3, rtol=1e-5)
+    simulation = warpmag.Simulation(path, device=device, dt=1e-3, rtol=1e-5)
     sites = np.flatnonzero([bool(text) for text in simulation.model.warpmag.source])
     currents = []
     for _ in range(25):
@@ -198,7 +198,7 @@ def test_a_coil_that_keys_move_without_a_body_follows_them(tmp_path, device):
     path = write(tmp_path, moved)
     assert not any("keys move" in str(finding) for finding in check(path).warnings)
     path.write_text(path.read_text().replace("metersPerUnit", "timeCodesPerSecond = 2400\n    metersPerUnit"))
-    simulation = warpmag.Simulation(path, device=device, step=1e-3, rtol=1e-5)
+    simulation = warpmag.Simulation(path, device=device, dt=1e-3, rtol=1e-5)
     for step in range(1, 13):
         simulation.step()
         z = 0.1 + 0.2 * min(2400.0 * 1e-3 * step / 24.0, 1.0)

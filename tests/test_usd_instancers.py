@@ -103,7 +103,7 @@ def test_two_hundred_balls_move_as_prims_do(device, tmp_path):
     np.testing.assert_allclose(poses, expected, rtol=0.0, atol=1e-15)  # transforms above bodies, in double precision
     np.testing.assert_array_equal(moments, theirs)
     for source, frame in ((tmp_path / "many.out.usda", 3), (tmp_path / "many.usda", 0)):
-        export(source, tmp_path / "render.usdc", rate=60.0)
+        export(source, tmp_path / "render.usdc", fps=60.0)
         stage = Usd.Stage.Open(str(tmp_path / "render.usdc"))
         shown = UsdGeom.PointInstancer(stage.GetPrimAtPath("/World/Render/Balls"))
         above = UsdGeom.XformCache(frame).GetLocalToWorldTransform(shown.GetPrim())

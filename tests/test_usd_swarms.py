@@ -126,7 +126,7 @@ def test_it_is_played_and_exported_as_prims_are(runs, whole, tmp_path):
         names = sorted(scene.bodies)
         poses.append(motion.poses(names)[:, :3])
         moments.append(motion.moments([*names, "/Magnet"]))
-        export(runs / f"{name}.usda", tmp_path / "out.usdc", rate=60.0, color="magnetization", arrows=True)
+        export(runs / f"{name}.usda", tmp_path / "out.usdc", fps=60.0, color="magnetization", arrows=True)
         stage = Usd.Stage.Open(str(tmp_path / "out.usdc"))
         balls = UsdGeom.PointInstancer(stage.GetPrimAtPath("/World/Render/Balls"))
         above = UsdGeom.XformCache(LAST).GetLocalToWorldTransform(balls.GetPrim())

@@ -10,7 +10,7 @@ import warpmag
 
 
 def simulate(path: str) -> None:
-    simulation = warpmag.Simulation(path, solver="mujoco", step=1e-3)
+    simulation = warpmag.Simulation(path, solver="mujoco", dt=1e-3)
     assert_type(simulation, warpmag.Simulation)
     assert_type(simulation.time, float)
     assert_type(simulation.magnetics, warpmag.Magnetics)

@@ -12,6 +12,7 @@ import warnings
 from importlib import import_module
 from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType
 
 from warpmag.terminal import collection_paused
 
@@ -55,6 +56,13 @@ _MOVED = {
 """Earlier and present names of documented modules."""
 
 
+class _MovedModule(ModuleType):
+    """A module under its earlier name. A call is one of the public function of the same name, which it hides."""
+
+    def __call__(self, *arguments, **named):
+        return getattr(self, self.__name__.rpartition(".")[2])(*arguments, **named)
+
+
 class _MovedModules:
     """Finder that imports a module by its earlier name, with a DeprecationWarning that names the present module."""
 
@@ -64,7 +72,7 @@ class _MovedModules:
 
     @staticmethod
     def create_module(spec):
-        return None
+        return _MovedModule(spec.name)
 
     @staticmethod
     def exec_module(module):

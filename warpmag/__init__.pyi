@@ -23,6 +23,9 @@ from warpmag.moments.fields import wrench as wrench
 from warpmag.moments.induction import InductionResult as InductionResult
 from warpmag.moments.induction import solve_induction as solve_induction
 from warpmag.moments.ranks import sweep as sweep
+from warpmag.show.export import export as export
+from warpmag.show.ray_tracing import render as render
 from warpmag.show.viewers import Display as Display
+from warpmag.usd import check as check
 
 __version__: str

@@ -8,12 +8,15 @@ import sys
 import traceback
 from pathlib import Path
 
-from warpmag import __version__
-from warpmag.declarations.magnets import CONTACT_MODELS, DYNAMICS, FORCES, METHODS, PRESETS, check_rtol, check_token
-from warpmag.engine.pile_xpbd.solvers import SOLVERS
+from warpmag.command_options import VIEWERS, make_parser
+from warpmag.declarations.checks import check_positive
+from warpmag.declarations.magnets import PRESETS, check_rtol
+from warpmag.declarations.materials import MATERIALS
 from warpmag.errors import InputError, SimulationError, one_line
+from warpmag.kernel_loading import watch_kernels
 from warpmag.moments.ranks import Ranks, current_ranks, is_first_rank, on_first_rank, without_ranks
 from warpmag.progress import Progress
+from warpmag.stopwatch import Stopwatch, process_age
 from warpmag.terminal import (
     Stopped,
     collection_paused,
@@ -23,60 +26,42 @@ from warpmag.terminal import (
     signals_guarded,
     signals_raised,
     silence,
+    skip_last_collection,
 )
 
 BAD_INPUT, FAILED, STOPPED = 2, 1, 128
 """Exit codes. 0 is success. A command ended by a signal exits with ``STOPPED`` plus the signal's number."""
 
-_VIEWERS = {"gl": "ViewerGL", "viser": "ViewerViser", "rerun": "ViewerRerun"}
 _BROWSER_VIEWERS = ("viser", "rerun")
 """Viewers in a browser, which show the scene only while the command runs."""
 _OUTPUT_FOLDER = Path("warpmag_out")
-_DEVICE_HELP = "Warp device, cpu or cuda:0 (default: the first GPU, else cpu)"
-
-
-class _Parser(argparse.ArgumentParser):
-    """A parser that raises :class:`InputError`."""
-
-    def error(self, message: str):
-        raise InputError(f"{message} (see {self.prog} --help)")
-
-
-class _Method(argparse.Action):
-    """Store the summation method. ``--sums``, and presets as values of ``--method``, are deprecated spellings."""
-
-    def __call__(self, parser, namespace, values, option_string=None):
-        """Store the value as the method, or as the preset if ``--method`` names a preset."""
-        option = self.option_strings[0]
-        name = "preset" if values in PRESETS and option == "--method" else "method"
-        if name == "method":
-            check_token(option.strip("-"), values, METHODS)
-        if f"--{name}" != option:
-            _warn([f"{option} {values} is deprecated, write --{name} {values}"])
-        setattr(namespace, name, values)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command and return its exit code."""
+    """Run the command and return its exit code. Without ``arguments``, its time counts from the process's start."""
+    stopwatch = Stopwatch(process_age() if arguments is None else 0.0)
     open_standard_files()
     try:
         all_ranks = current_ranks()
     except InputError as error:
         log(error)
         return BAD_INPUT
-    code, line = _execute(arguments, all_ranks)
+    code, line = _execute(arguments, all_ranks, stopwatch)
     if line and all_ranks is not None:
         all_ranks.fail(line, code, log)
     elif line:
         log(line)
+    if arguments is None:
+        skip_last_collection()
     return code
 
 
-def _execute(arguments: list[str] | None, all_ranks: Ranks | None) -> tuple[int, str]:
+def _execute(arguments: list[str] | None, all_ranks: Ranks | None, stopwatch: Stopwatch) -> tuple[int, str]:
     """Run the command and return its exit code and an error line, which is empty on success."""
     try:
         with signals_raised():
             options = _parser().parse_args(arguments)
+            options.stopwatch = stopwatch
             if not is_first_rank(all_ranks):
                 if options.command is not _run:
                     return 0, ""  # ranks share the command 'run' only
@@ -107,82 +92,8 @@ def _execute(arguments: list[str] | None, all_ranks: Ranks | None) -> tuple[int,
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="warpmag", description="Magnets for the Newton physics engine.")
-    parser.add_argument("--version", action="version", version=f"warpmag {__version__}")
-    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    _add_run(commands)
-    scenes = commands.add_parser("scenes", help="list the bundled scenes")
-    scenes.set_defaults(command=_scenes)
-
-    check = commands.add_parser("check", help="report the contents and the errors of a stage")
-    check.add_argument("stage", metavar="STAGE", help="a USD file, or a bundled scene")
-    check.set_defaults(command=_check)
-
-    _add_render(commands)
-    _add_export(commands)
-    return parser
-
-
-def _add_run(commands) -> None:
-    run = commands.add_parser("run", help="simulate a scene and write it as a USD stage")
-    run.set_defaults(command=_run)
-    add = run.add_argument
-    add("scene", metavar="SCENE", help="a bundled scene (see 'warpmag scenes') or a USD file")
-    add("-o", "--output", metavar="OUT", help="USD file to write (default: warpmag_out/SCENE.usda)")
-    add("--balls", type=int, metavar="N", help="number of balls of falling_magnet, sakura_tree or million")
-    add("--frames", type=int, metavar="N", help="output frames to simulate (default: the time range of the stage)")
-    add("--resume", action="store_true", help="continue the run at the output, if there is one")
-    add("--device", help=_DEVICE_HELP)
-    add("--solver", choices=SOLVERS, default=next(iter(SOLVERS)), help="rigid-body solver (default: %(default)s)")
-    text = "force law, dynamics, and curve of all magnets: from this library, Kim and Han 2022, or Kim et al. 2018"
-    add("--preset", choices=PRESETS, help=text)
-    add("--force", choices=FORCES, help="force law (default: the stage's)")
-    add("--dynamics", choices=DYNAMICS, help="magnetization dynamics (default: the stage's)")
-    add("--contact-model", choices=CONTACT_MODELS, help="model of balls that nearly touch (default: the stage's)")
-    names = f"{{{','.join(METHODS)}}}"
-    text = "summation by the faster method, over all pairs, or by multipoles (default: %(default)s)"
-    add("--method", action=_Method, default=METHODS[0], metavar=names, help=text)
-    add("--sums", dest="method", action=_Method, default=METHODS[0], help=argparse.SUPPRESS)
-    text = "relative magnetization error at which induction ends, at least 2e-6 (default: the stage's)"
-    add("--rtol", type=float, metavar="X", help=text)
-    text = "viewer that shows the run (default: %(default)s)"
-    add("--viewer", choices=("none", *_VIEWERS), default="none", help=text)
-    text = "also write a stage for renderers beside the output, as 'warpmag export' does"
-    add("--for", dest="purpose", choices=("render",), help=text)
-
-
-def _add_render(commands) -> None:
-    render = commands.add_parser("render", help="draw frames of a stage or of a finished run")
-    render.set_defaults(command=_render)
-    add = render.add_argument
-    add("stage", metavar="STAGE", help="a USD file, or a bundled scene")
-    add("-o", "--output", metavar="FILE", required=True, help="picture (.png) or film (.mp4, .gif)")
-    frames = render.add_mutually_exclusive_group()
-    text = "number of the frame to draw, 0 for the start (default: the last)"
-    frames.add_argument("--frame", type=int, metavar="N", help=text)
-    frames.add_argument("--frames", metavar="A:B", help="first and last frame to draw (default for a film: all)")
-    add("--size", metavar="WxH", default="960x540", help="width and height [px] (default: %(default)s)")
-    text = "draft, or final by Blender's path tracer (default: %(default)s)"
-    add("--quality", choices=("draft", "final"), default="draft", help=text)
-    add("--moments", action="store_true", help="draw the moments of a finished run as arrows")
-    add("--device", help=_DEVICE_HELP)
-
-
-def _add_export(commands) -> None:
-    text = "export a scene or a finished run: a stage for renderers, a web page, or numbers"
-    export = commands.add_parser("export", help=text)
-    export.set_defaults(command=_export)
-    add = export.add_argument
-    add("stage", metavar="STAGE", help="a USD file, or a bundled scene")
-    text = "file: .usda, .usdc or .usdz for renderers, .html for a web page, .npz or .csv for numbers"
-    add("-o", "--output", metavar="OUT", required=True, help=text)
-    text = "frames per second (default: %(default)g, as in Blender)"
-    add("--rate", type=float, default=24.0, metavar="HZ", help=text)
-    add("--color", metavar="QUANTITY", help="color bodies by magnetization, speed or force")
-    add("--arrows", action="store_true", help="draw moments as arrows")
-    add("--field-lines", type=int, default=0, metavar="N", help="draw N field lines of the permanent magnets")
-    add("--materialx", action="store_true", help="also write materials as MaterialX")
-    add("--device", help=_DEVICE_HELP)
+    commands = {"run": _run, "scenes": _scenes, "materials": _materials}
+    return make_parser({**commands, "check": _check, "render": _render, "export": _export})
 
 
 def _scenes(options) -> int:
@@ -193,6 +104,20 @@ def _scenes(options) -> int:
     width = max(map(len, lines))
     for name, line in sorted(lines.items()):
         print(f"{name:{width}}  {line}")
+    return 0
+
+
+def _materials(_) -> int:
+    rows = [("name", "kind", "strength", "relative permeability", "density")]
+    for material in MATERIALS.values():
+        soft = material.kind == "inducible"
+        strength = f"{'saturation' if soft else 'remanence'} {material.polarization:g} T"
+        permeability = f"{material.permeability:g}" if soft else "-"
+        kind = f"{material.kind}{', measured curve' if material.curve else ''}"
+        rows.append((material.name, kind, strength, permeability, f"{material.density:g} kg/m³"))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        print("  ".join(f"{text:{width}}" for text, width in zip(row, widths, strict=True)).rstrip())
     return 0
 
 
@@ -255,7 +180,18 @@ def _check(options) -> int:
     for severity, lines in (("error", errors), ("warning", warnings)):
         for line in lines:
             print(f"{severity:11} {line}")
+    print(f"verdict     {_verdict(len(errors), len(warnings))}")
     return BAD_INPUT if errors else 0
+
+
+def _verdict(errors: int, warnings: int) -> str:
+    """Return the result of a check in words."""
+    noted = f", with {_counted(warnings, 'warning')}" if warnings else ""
+    return f"cannot be run: {_counted(errors, 'error')}" if errors else f"ready to run{noted}"
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' * (number != 1)}"
 
 
 @collection_paused()
@@ -268,10 +204,20 @@ def _load(path: Path, **options):
 
 
 def _start_warp(path: Path) -> None:
-    """Initialize Warp; on a terminal, print that the stage is loading. Call this before the engine is imported."""
-    quiet_warp()
+    """Initialize Warp; on a terminal, print that the stage is loading. Call this before the engine is imported.
+
+    A compilation of kernels is announced before it begins, on a terminal or not.
+    """
     if sys.stderr.isatty():
-        print(f"{path.stem}: loading (the first run compiles kernels for a minute or two)", file=sys.stderr)
+        _status(f"{path.stem}: loading")
+    quiet_warp()
+    watch_kernels(lambda: _status(f"{path.stem}: compiling kernels, once for this version, for a minute or two"))
+
+
+def _status(line: str) -> None:
+    """Print a line on stderr, of the first rank, on a line of its own also where a bar is drawn."""
+    if is_first_rank(current_ranks()):
+        Progress.interrupt(line)
 
 
 def _render(options) -> int:
@@ -280,15 +226,15 @@ def _render(options) -> int:
     if options.quality == "final":
         from warpmag.show.blender import render_final  # noqa: PLC0415
 
-        if options.frames or options.moments:
-            raise InputError("quality: 'final' draws one frame without moments; 'warpmag export --arrows' draws them")
+        if options.frames or options.arrows:
+            raise InputError("quality: 'final' draws one frame without arrows; 'warpmag export --arrows' draws them")
         size = _pair("size", options.size, "x")
         print(f"written {render_final(path, options.output, frame=options.frame, size=size)}")
         return 0
     from warpmag.show.ray_tracing import render  # noqa: PLC0415
 
     frames = _pair("frames", options.frames, ":") if options.frames is not None else None
-    settings = {"size": _pair("size", options.size, "x"), "moments": options.moments, "device": options.device}
+    settings = {"size": _pair("size", options.size, "x"), "arrows": options.arrows, "device": options.device}
     written = render(path, options.output, frame=options.frame, frames=frames, **settings)
     print(f"written {written[0]}{f' to {written[-1].name}' if len(written) > 1 else ''}")
     return 0
@@ -307,7 +253,7 @@ def _export(options) -> int:
     _start_warp(path)
     from warpmag.show.export import export  # noqa: PLC0415
 
-    names = ("rate", "color", "arrows", "field_lines", "materialx", "device")
+    names = ("fps", "color", "arrows", "field_lines", "materialx", "device")
     for line in export(path, options.output, **{name: getattr(options, name) for name in names}):
         print(line)
     print(f"written {options.output}")
@@ -315,14 +261,12 @@ def _export(options) -> int:
 
 
 def _run(options) -> int:
-    if options.frames is not None and options.frames < 1:
-        raise InputError(f"frames: must be positive, got {options.frames}")
-    if options.rtol is not None:
-        check_rtol("rtol", options.rtol)
-    if options.viewer != "none" and current_ranks() is not None:
-        raise InputError("viewer: a run with several ranks cannot have one")
+    _check_run(options)
     folder = Path(options.output).parent if options.output else _OUTPUT_FOLDER
     path, is_bundled = _find_scene(options.scene, options.balls, folder)
+    output = Path(options.output) if options.output else _OUTPUT_FOLDER / f"{path.stem}.usda"
+    if not (options.overwrite or options.resume):
+        on_first_rank(lambda: _check_new(output), current_ranks())
     display, resume = None, options.resume
     while True:
         simulation = _simulation_of(path, options)
@@ -330,27 +274,55 @@ def _run(options) -> int:
             display.restart(simulation.model, simulation.magnetics)
         else:
             display = _open_display(options.viewer, simulation)
-        _simulate(simulation, path, options, display, copy_scene=is_bundled, resume=resume)
+        options.stopwatch.end_part("loading")
+        _simulate(simulation, output, options, display, copy_scene=is_bundled, resume=resume)
         if not (display and display.restarted):
             return 0
         resume = False  # a restart in the viewer begins at the first frame
 
 
+def _check_run(options) -> None:
+    """Raise :class:`InputError` for options that no scene can have."""
+    if options.frames is not None and options.frames < 1:
+        raise InputError(f"frames: must be positive, got {options.frames}")
+    for name in ("duration", "step"):
+        if (seconds := getattr(options, name)) is not None:
+            check_positive(name, seconds)
+    if options.rtol is not None:
+        check_rtol("rtol", options.rtol)
+    if options.viewer != "none" and current_ranks() is not None:
+        raise InputError("viewer: a run with several ranks cannot have one")
+
+
+def _check_new(output: Path) -> None:
+    """Raise :class:`InputError` if the output exists."""
+    if output.exists():
+        raise InputError(f"{output}: exists; give --overwrite, --resume to continue that run, or another -o")
+
+
 def _simulation_of(path: Path, options):
     """Return the simulation that the options describe."""
     preset = PRESETS[options.preset] if options.preset else None
-    settings = {name: getattr(options, name) for name in ("solver", "contact_model", "method", "rtol", "device")}
+    names = ("solver", "contact_model", "method", "rtol", "external_field", "device")
+    settings = {name: getattr(options, name) for name in names}
     settings["force"] = options.force or (preset and preset.force)
     settings["dynamics"] = options.dynamics or (preset and preset.dynamics)
-    return _load(path, **settings, curve=preset and preset.curve, visuals=options.viewer != "none")
+    settings |= {"dt": options.step, "curve": preset and preset.curve, "visuals": options.viewer != "none"}
+    return _load(path, **settings)
 
 
-def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, resume: bool) -> None:
+def _frames_of(simulation, options) -> int:
+    """Return the number of frames that the options ask for."""
+    if options.duration is None:
+        return simulation.frames_of(options.frames)
+    return simulation.frames_of(max(1, round(options.duration * simulation.frame_rate)))
+
+
+def _simulate(simulation, output: Path, options, display, *, copy_scene: bool, resume: bool) -> None:
     """Run to the end, or until the viewer restarts or closes, and print the summary."""
-    output = Path(options.output) if options.output else _OUTPUT_FOLDER / f"{path.stem}.usda"
     warnings = simulation.warnings()
     _warn(warnings)
-    progress = Progress(simulation.frames_of(options.frames))
+    progress = Progress(_frames_of(simulation, options))
 
     def show(frame: int) -> bool:
         if is_first_rank(current_ranks()):
@@ -361,26 +333,36 @@ def _simulate(simulation, path: Path, options, display, *, copy_scene: bool, res
         statistics = simulation.run(progress.frames, output=output, copy_scene=copy_scene, resume=resume, on_frame=show)
     finally:
         progress.close()
+    options.stopwatch.end_part("run")
     if (display and display.restarted) or not is_first_rank(current_ranks()):
         return
     if progress.done is None:
         print(f"complete       {output} already has all {progress.frames} frames")
         return
-    for line in statistics.summary():
+    for line in statistics.summary(details=options.verbose):
         print(line)
     print(f"written        {output}")
-    if options.purpose:
-        from warpmag.show.export import export  # noqa: PLC0415
-
-        with without_ranks():
-            export(output, rendered := output.with_name(f"{output.stem}.render.usdc"), device=options.device)
-        print(f"to render      {rendered}")
+    _export_beside(output, options)
     _warn([line for line in simulation.warnings() if line not in warnings])
     if simulation.capture_failure:
         _warn([f"steps were launched kernel by kernel, which is slower: {simulation.capture_failure}"])
     if display is not None and options.viewer in _BROWSER_VIEWERS and display.viewer.is_running():
         log(f"the {options.viewer} viewer shows the last frame until Ctrl-C")
         display.stay()
+        options.stopwatch.end_part("viewing")
+    options.stopwatch.end_part("rest")
+    print(options.stopwatch.line())
+
+
+def _export_beside(output: Path, options) -> None:
+    """Write a stage for renderers beside the output if the options ask for it."""
+    if options.purpose:
+        from warpmag.show.export import export  # noqa: PLC0415
+
+        with without_ranks():
+            export(output, rendered := output.with_name(f"{output.stem}.render.usdc"), device=options.device)
+        print(f"to render      {rendered}")
+        options.stopwatch.end_part("export")
 
 
 def _warn(lines: list[str]) -> None:
@@ -396,7 +378,7 @@ def _open_display(name: str, simulation):
     from warpmag.show.viewers import Display, no_viewer  # noqa: PLC0415
 
     try:
-        viewer = getattr(newton.viewer, _VIEWERS[name])()
+        viewer = getattr(newton.viewer, VIEWERS[name])()
     except Exception as error:  # viewers raise errors of many types
         raise no_viewer(name, error) from None
     display = Display(viewer, simulation.model, simulation.magnetics)

@@ -35,7 +35,7 @@ class Example:
         cube = builder.add_shape_box(-1, xform=above, hx=half, hy=half, hz=half, cfg=iron)
         warpmag.add_permanent(builder, shape=cube, magnetization=(0.0, 0.0, 1e6))
 
-        self.simulation = warpmag.Simulation(builder, step=1e-3)
+        self.simulation = warpmag.Simulation(builder, dt=1e-3)
         self.display = warpmag.Display(viewer, self.simulation.model, self.simulation.magnetics)
         self.viewer = viewer
         self.energies = [self.energy()]

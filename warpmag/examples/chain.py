@@ -40,7 +40,7 @@ class Example:
             builder.add_shape_sphere(ball, radius=RADIUS, cfg=smooth)
             warpmag.add_permanent(builder, body=ball, magnetization=(0.0, 2e5, 0.0))
 
-        self.simulation = warpmag.Simulation(builder, step=1e-3)
+        self.simulation = warpmag.Simulation(builder, dt=1e-3)
         self.display = warpmag.Display(viewer, self.simulation.model, self.simulation.magnetics)
         self.viewer = viewer
         self.torques = []

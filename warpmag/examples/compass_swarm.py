@@ -47,7 +47,7 @@ class Example:
         builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
         builder.replicate(row, args.rows)
 
-        self.simulation = warpmag.Simulation(builder, step=5e-4)
+        self.simulation = warpmag.Simulation(builder, dt=5e-4)
         self.magnetics = self.simulation.magnetics
         self.display = warpmag.Display(viewer, self.simulation.model, self.magnetics)
         self.viewer = viewer

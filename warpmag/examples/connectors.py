@@ -31,7 +31,7 @@ class Example:
         self.add_connector(builder, wp.transform_identity(), face=1.0)
         self.add_connector(builder, wp.transform((2 * HALF[0] + GAP, 0.003, 0.002), wp.mul(yaw, twist)), face=-1.0)
 
-        self.simulation = warpmag.Simulation(builder, step=1e-3)
+        self.simulation = warpmag.Simulation(builder, dt=1e-3)
         self.display = warpmag.Display(viewer, self.simulation.model, self.simulation.magnetics)
         self.viewer = viewer
 

@@ -44,7 +44,7 @@ class Example:
             if steel:
                 warpmag.add_inducible(builder, body=ball, material="1010-steel")
 
-        self.simulation = warpmag.Simulation(builder, step=1e-3)
+        self.simulation = warpmag.Simulation(builder, dt=1e-3)
         self.coils = args.coils
         self.display = warpmag.Display(viewer, self.simulation.model, self.simulation.magnetics)
         self.viewer, self.start = viewer, self.positions()

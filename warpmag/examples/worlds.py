@@ -50,7 +50,7 @@ class Example:
         builder.replicate(world, args.world_count)
         builder.add_ground_plane()
 
-        self.simulation = warpmag.Simulation(builder, step=1e-3)
+        self.simulation = warpmag.Simulation(builder, dt=1e-3)
         self.currents = lifting_current() * np.linspace(0.9, 1.1, args.world_count)
         self.simulation.magnetics.set_current("coil", self.currents)
         self.display = warpmag.Display(viewer, self.simulation.model, self.simulation.magnetics)

@@ -59,7 +59,7 @@ def render_final(
     code = round(clock.start * per_code) + (last if frame is None else frame)
     with tempfile.TemporaryDirectory() as folder:
         exported, drawn = Path(folder) / "stage.usdc", Path(folder) / f"picture{path.suffix}"
-        export(stage, exported, rate=clock.frames_per_second, **overlays)
+        export(stage, exported, fps=clock.frames_per_second, **overlays)
         script = Path(__file__).with_name("blender_script.py")
         numbers = map(str, (code, samples, *size))
         done = subprocess.run([python, "-P", script, exported, drawn, *numbers], capture_output=True, text=True)

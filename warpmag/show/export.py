@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from warpmag.declarations.checks import check_positive, check_token, short_repr
+from warpmag.deprecation import renamed_arguments
 from warpmag.errors import InputError
 from warpmag.show.magnet_overlays import COLORS, MagnetOverlays
 from warpmag.show.renderer_stage import RendererStage
@@ -17,11 +18,12 @@ _TOP = 0.99
 """Quantile of the values at which the color scale ends, so that a few collisions do not compress the scale."""
 
 
+@renamed_arguments(rate="fps")
 def export(
     stage: str | os.PathLike,
     output: str | os.PathLike,
     *,
-    rate: float = 24.0,
+    fps: float = 24.0,
     color: str | None = None,
     arrows: bool = False,
     field_lines: int = 0,
@@ -37,7 +39,7 @@ def export(
     Args:
         stage: USD file.
         output: File to write: ``.usd``, ``.usda``, ``.usdc``, ``.usdz``, ``.html``, ``.npz`` or ``.csv``.
-        rate: Frames, and time codes, per second [1/s]; Blender plays at 24, a page in real time.
+        fps: Frames, and time codes, per second [1/s]; Blender plays at 24, a page in real time.
         color: Quantity that colors the bodies: ``magnetization``, ``speed``, or ``force`` (the magnetic force between
             the moments of the frame); by default bodies have their materials.
         arrows: Draw moments as arrows.
@@ -52,7 +54,7 @@ def export(
         InputError: The stage cannot be read, the output cannot be written, or an argument is wrong.
     """
     suffix = usable_path(output).suffix
-    check_positive("rate", rate)
+    check_positive("fps", fps)
     if not (isinstance(field_lines, int) and field_lines >= 0):
         raise InputError(f"field_lines: must be a whole number from 0 on, got {short_repr(field_lines)}")
     if color is not None:
@@ -60,7 +62,7 @@ def export(
     if suffix in (".npz", ".csv"):
         _write_numbers(stage, usable_path(output))
         return []
-    render, notes = RendererStage(stage, rate=rate), []
+    render, notes = RendererStage(stage, rate=fps), []
     if (color or arrows or field_lines) and not render.recording.magnets:
         raise InputError(f"{stage}: has no moments to show, since no run has written it")
     magnets = MagnetOverlays(render) if color or arrows or field_lines else None

@@ -21,6 +21,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag.deprecation import renamed_arguments
 from warpmag.engine.newton_versions import camera_type
 from warpmag.engine.stepping.scene import ImportedScene, import_scene
 from warpmag.errors import InputError
@@ -47,6 +48,7 @@ _HIGHLIGHT, _SHARPNESS = 4.0, 180.0
 """Radiance of the sun's reflection in a polished surface, and the exponent by which it fades (Phong 1975)."""
 
 
+@renamed_arguments(moments="arrows")
 def render(
     stage: str | os.PathLike,
     output: str | os.PathLike,
@@ -54,7 +56,7 @@ def render(
     frame: int | None = None,
     frames: tuple[int, int] | None = None,
     size: tuple[int, int] = (960, 540),
-    moments: bool = False,
+    arrows: bool = False,
     device: str | None = None,
 ) -> list[Path]:
     """Draw a stage.
@@ -65,7 +67,7 @@ def render(
         frame: Frame after the start, at the stage's frame rate; by default the last, for a film all frames.
         frames: First and last frame of several; the name of each picture contains the number of its frame.
         size: Width and height [px].
-        moments: Show the moments of the recording as arrows.
+        arrows: Draw the moments of the recording as arrows.
         device: Warp device; by default Warp's.
 
     Returns:
@@ -83,7 +85,7 @@ def render(
     codes = [clock.start + number * clock.time_codes_per_second / clock.frames_per_second for number in numbers]
     with wp.ScopedDevice(resolve_device(device)):
         scene = import_scene(stage, visuals=True, time_code=min(codes[0], clock.end))
-        renderer = _Renderer(scene, stage, size, moments)
+        renderer = _Renderer(scene, stage, size, arrows)
         pictures = (renderer.picture(code) for code in codes)
         return films.write(output, pictures, numbers, clock.frames_per_second)
 
@@ -104,9 +106,9 @@ def _numbers(stage, clock: StageClock, output: Path, frame: int | None, frames: 
 class _Renderer:
     """A stage, imported from ``path`` with its visual shapes, and a camera for pictures of ``size`` [px]."""
 
-    def __init__(self, scene: ImportedScene, path, size: tuple[int, int], moments: bool):
+    def __init__(self, scene: ImportedScene, path, size: tuple[int, int], arrows: bool):
         self._scene, self._motion, (self._width, self._height) = scene, Playback(scene.stage, scene.swarms), size
-        self._arrows = _Arrows(scene, path) if moments else None
+        self._arrows = _Arrows(scene, path) if arrows else None
         self._model = model = scene.builder.finalize()
         self._state = model.state()
         ray_tracer = camera_type()

@@ -12,9 +12,10 @@ from warpmag.declarations import materials
 from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.likely_units import warn_of_magnetization, warn_of_radius
 from warpmag.declarations.magnets import Magnet
+from warpmag.deprecation import keyword_arguments
 from warpmag.engine.magnets.attributes import check_registered, mark_shapes
 from warpmag.engine.magnets.body_mass import give_density
-from warpmag.engine.magnets.selection import body_by_keyword, selected
+from warpmag.engine.magnets.selection import selected
 from warpmag.errors import InputError
 
 _SOLID = [
@@ -24,7 +25,7 @@ _SOLID = [
 """Types of shapes with a volume."""
 
 
-@body_by_keyword
+@keyword_arguments("body")
 def add_inducible(
     builder: newton.ModelBuilder,
     *,
@@ -84,7 +85,7 @@ def add_inducible(
     return shapes
 
 
-@body_by_keyword
+@keyword_arguments("body")
 def add_permanent(
     builder: newton.ModelBuilder,
     *,

@@ -14,8 +14,9 @@ import warp as wp
 from warpmag.declarations.attributes import NAMESPACE
 from warpmag.declarations.checks import check_whole, short_repr
 from warpmag.declarations.coils import LARGEST_POINT, Coil, FieldMap, SourceRecord, checked_vectors
+from warpmag.deprecation import keyword_arguments
 from warpmag.engine.magnets.attributes import check_registered
-from warpmag.engine.magnets.selection import body_by_keyword, selected
+from warpmag.engine.magnets.selection import selected
 from warpmag.errors import InputError
 from warpmag.moments.arrays import host_array
 
@@ -23,7 +24,7 @@ _UNIT_TOLERANCE = 1e-3
 """Largest deviation of a quaternion's norm from 1; components are often rounded to few digits."""
 
 
-@body_by_keyword
+@keyword_arguments("body")
 def add_coil(
     builder: newton.ModelBuilder,
     *,
@@ -73,13 +74,14 @@ def add_coil(
     return _add_source(builder, body, coil.record(), ampere_turns, xform, "coil", label)
 
 
+@keyword_arguments("origin", "spacing", "values")
 def add_field_map(
     builder: newton.ModelBuilder,
-    origin: tuple[float, float, float],
-    spacing: npt.ArrayLike,
-    values: npt.ArrayLike,
     *,
     body: int | str = -1,
+    origin: npt.ArrayLike,
+    spacing: npt.ArrayLike,
+    values: npt.ArrayLike,
     factor: float = 1.0,
     xform: wp.transform | tuple | None = None,
     label: str | None = None,
@@ -92,10 +94,10 @@ def add_field_map(
 
     Args:
         builder: The builder, with :func:`warpmag.register_custom_attributes` called on it.
+        body: Index or label of the body; -1 for a map fixed in the world.
         origin: Position of the first node [m], in the frame of the map.
         spacing: Distance between nodes [m], one number or one along each axis.
         values: Field H at the nodes [A/m], shape [nx, ny, nz, 3], at least two along each axis, NumPy.
-        body: Index or label of the body; -1 for a map fixed in the world.
         factor: Factor on the field; :meth:`warpmag.Magnetics.set_current` changes it.
         xform: Pose of the map in the frame of the body, or in the world.
         label: Label of the map.

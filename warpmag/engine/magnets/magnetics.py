@@ -11,6 +11,7 @@ from warpmag.declarations import materials
 from warpmag.declarations.checks import check_positive, check_vector, check_whole, short_repr
 from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.magnets import MagneticSettings, check_magnetization
+from warpmag.deprecation import renamed_arguments
 from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.caller_checks import check_state, held_by_model
 from warpmag.engine.magnets.eddy import gather_velocities, set_conductivities
@@ -64,6 +65,7 @@ class Magnetics:
             common volume belongs to the first of them.
     """
 
+    @renamed_arguments(step="dt")
     @collection_paused()
     def __init__(
         self,
@@ -77,7 +79,7 @@ class Magnetics:
         external_field: tuple[float, float, float] = (0.0, 0.0, 0.0),
         max_evaluations: int = 1000,
         curve: str | MagnetizationCurve | None = None,
-        step: float = 1e-3,
+        dt: float = 1e-3,
     ):
         """Sample the magnets of ``model`` and allocate all buffers.
 
@@ -95,7 +97,7 @@ class Magnetics:
             external_field: Uniform applied field H0 [A/m], world frame.
             max_evaluations: Field evaluations after which an unconverged induction solve ends.
             curve: Magnetization curve of all magnets, see :func:`warpmag.add_inducible`; by default each magnet's own.
-            step: Longest time between calls of :meth:`apply` [s]. Drag by eddy currents is limited so that it stops no
+            dt: Longest time between calls of :meth:`apply` [s]. Drag by eddy currents is limited so that it stops no
                 body within this time.
 
         Raises:
@@ -105,10 +107,10 @@ class Magnetics:
         self._held = held_by_model(model)
         settings = MagneticSettings(external_field, force, dynamics, contact_model, rtol)
         if (all_ranks := current_ranks()) is not None:
-            others = {"method": method, "max_evaluations": max_evaluations, "curve": curve, "step": step}
+            others = {"method": method, "max_evaluations": max_evaluations, "curve": curve, "dt": dt}
             all_ranks.check_equal(vars(settings) | others | magnetic_arrays(model), "Magnetics: ")
         settings.check("Magnetics")
-        check_positive("Magnetics: step", step)
+        check_positive("Magnetics: dt", dt)
         if curve is not None:
             curve = materials.measured("Magnetics: curve", curve)
         self.magnets, self._worlds = find_magnets(model)
@@ -124,7 +126,7 @@ class Magnetics:
         )
         self._sources.bind(self.system)
         self._map_bodies()
-        set_conductivities(model, self.magnets, self.system, step)
+        set_conductivities(model, self.magnets, self.system, dt)
 
     @property
     def device(self) -> wp.Device:

@@ -1,39 +1,14 @@
 """Bodies and shapes of a Newton builder, selected by index, by label or by a pattern of labels."""
 
 import difflib
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from fnmatch import fnmatchcase
-from functools import wraps
-from typing import Any, ParamSpec, TypeVar, cast
 
 from warpmag.declarations.checks import check_whole, short_repr
 from warpmag.errors import InputError
 
 _WILDCARDS = "*?["
 _MOST_LISTED = 3  # labels in a message
-Parameters = ParamSpec("Parameters")
-Result = TypeVar("Result")
-
-
-def body_by_keyword(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Return ``function(builder, *, body, ...)``, which also takes the body by position, with a DeprecationWarning.
-
-    By position an index of a shape passed for that of a body, and another shape became the magnet.
-    """
-
-    call = cast(Any, function)
-
-    @wraps(function)
-    def with_body(builder, *positions, **values):
-        if positions:
-            name = function.__name__
-            message = f"{name}: name the body, {name}(builder, body={short_repr(positions[0])}, ...)"
-            warnings.warn(message, DeprecationWarning, stacklevel=2)
-            values = {"body": positions[0], **values}
-        return call(builder, *positions[1:], **values)
-
-    return cast(Any, with_body)
 
 
 def selected(name: str, wanted: int | str, labels: Sequence[str], noun: str) -> list[int]:

@@ -42,7 +42,7 @@ class Statistics:
         farthest: Largest distance of a magnet from the mean initial position, in any frame [m].
         overlapping: Number of overlapping contacts at the start.
         coarseness: Spacing of single-precision positions at the start over the thickness of the thinnest body.
-        wall_seconds: Duration of the run [s].
+        wall_seconds: Duration of the run [s]; in ``warpmag run`` without the compilation of kernels.
     """
 
     magnets: int = 0
@@ -127,21 +127,18 @@ class Statistics:
             lines.append(f"bodies were too fast for the shortest substep in {self.capped} of {self.steps} steps")
         return lines
 
-    def summary(self) -> list[str]:
-        """Return the summary of the run, line by line."""
+    def summary(self, details: bool = True) -> list[str]:
+        """Return the summary of the run, line by line.
+
+        Args:
+            details: Include the times of a step, field evaluations, substeps and buffer growths.
+        """
         if not self.steps:
             return ["no steps"]
-        induction, force, rigid = self.milliseconds
-        evaluations = np.array(self.evaluations)
-        duration = f" in {self.wall_seconds:.1f} s" if self.wall_seconds else ""  # steps outside of a run are not timed
-        by_multipoles = f", of fields by multipoles {self.field_error:.1e} at the end" if self.field_error else ""
         lines = [
             f"magnets        {self.magnets} moving",
-            f"steps          {self.steps} ({self.substeps / self.steps:.2f} substeps each, {self.repeated} repeated, "
-            f"{self.regrown} buffer growths){duration}",
-            f"time per step  Ti {induction:.2f} ms, Tf {force:.2f} ms, Tr {rigid:.2f} ms",
-            f"field          {evaluations.mean():.1f} evaluations per step (median {np.median(evaluations):.0f}, "
-            f"max {evaluations.max()}), magnetization error at most {self.error:.1e}{by_multipoles}",
+            f"steps          {self.steps}",
+            *(self._details() if details else ()),
             f"speed          RMS {100.0 * self.rms_speed:.2f} cm/s at the end, peak {self.peak_speed:.2f} m/s",
             f"penetration    {100.0 * self.overlap:.2f} % of the radius at most ({1e3 * self.depth:.4f} mm), "
             f"{100.0 * self.final_overlap:.2f} % at the end",
@@ -151,6 +148,22 @@ class Statistics:
             rms, median = 100.0 * self.held_rms_speed, 100.0 * self.held_median_speed
             lines.append(f"held           {self.held} by a magnet, RMS {rms:.2f} cm/s, median {median:.2f}")
         return lines
+
+    def _details(self) -> list[str]:
+        """Return the lines about substeps, times and fields."""
+        induction, force, rigid = self.milliseconds
+        evaluations = np.array(self.evaluations)
+        mean = 1e3 * self.wall_seconds / self.steps
+        whole = f"{mean:.2f} ms with output: " if mean else ""  # steps outside of a run are not timed
+        by_multipoles = f", of fields by multipoles {self.field_error:.1e} at the end" if self.field_error else ""
+        return [
+            f"substeps       {self.substeps / self.steps:.2f} each, {self.repeated} steps repeated, "
+            f"{self.regrown} buffer growths",
+            f"time per step  {whole}induction Ti {induction:.2f} ms, forces Tf {force:.2f} ms, "
+            f"bodies Tr {rigid:.2f} ms",
+            f"field          {evaluations.mean():.1f} evaluations per step (median {np.median(evaluations):.0f}, "
+            f"max {evaluations.max()}), magnetization error at most {self.error:.1e}{by_multipoles}",
+        ]
 
 
 def find_held(pairs: np.ndarray, holders: np.ndarray, fixed: np.ndarray) -> np.ndarray:
