@@ -187,7 +187,7 @@ def test_a_graph_does_what_launches_do(device):
 
 def test_a_run_of_a_scene_of_another_number_of_balls(device, tmp_path, capsys):
     out, scene = tmp_path / "out.usda", tmp_path / "falling_magnet_150.usdc"
-    options = ["--method", "fmm", "--frames", "1", "--device", device, "-o", str(out)]
+    options = ["--method", "fmm", "--frames", "1", "--verbose", "--device", device, "-o", str(out)]
     assert main(["run", "falling_magnet", "--balls", "150", *options]) == 0
     printed = capsys.readouterr()
     assert "151 moving" in printed.out

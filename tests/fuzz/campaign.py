@@ -40,7 +40,7 @@ _FRESH = {name: value for name, value in os.environ.items() if name != "PXR_WORK
 _CAUSES = ("overlapped at the start", "apart at the start", "too fast for the shortest substep")
 """What may end a run of a sound stage, and has to be named then."""
 _READING = re.compile("USD's reader crashes on it|USD did not read it within")
-_EXPECTED = re.compile(r"^warpmag: |^$|^\S+: loading|frame/s|s/frame|frame \[")
+_EXPECTED = re.compile(r"^warpmag: |^$|^\S+: (loading|compiling)|frame/s|s/frame|frame \[")
 
 
 @dataclass
