@@ -3,8 +3,11 @@
 import newton
 import numpy as np
 import pytest
+import warp as wp
 from pxr import Usd
+from small_builders import add_ball, new_builder
 
+import warpmag
 from warpmag import cli
 from warpmag.errors import extra
 from warpmag.scenes_usd import balls_up
@@ -69,6 +72,37 @@ def test_a_viewer_sees_every_frame(scene, device, monkeypatch, tmp_path):
     assert Notes.last.shown == 4
     # from the ground to the magnet, whose face is 30 mm above it; contacts give way by parts of a radius of 5 mm
     assert Notes.last.heights == pytest.approx([0.005, 0.025, 0.025, 0.025], abs=1e-4)
+
+
+@wp.kernel(enable_backward=False)
+def press(force: float, body: int, body_f: wp.array[wp.spatial_vector]):
+    body_f[body] = body_f[body] + wp.spatial_vector(wp.vec3(0.0, 0.0, -force), wp.vec3(0.0))
+
+
+class Dragging(Notes):
+    """A viewer whose mouse presses the ball down."""
+
+    def apply_forces(self, state):
+        wp.launch(press, dim=1, inputs=[10.0, self.moving, state.body_f], device=state.body_f.device)
+
+
+def test_the_mouse_drags_bodies(scene, device, monkeypatch, tmp_path):
+    """10 N down keep the ball on the ground, which else jumps to the magnet within a frame; here in a graph."""
+    assert watch(scene, tmp_path / "out.usda", device, monkeypatch, Dragging) == 0
+    assert Notes.last.heights == pytest.approx([0.005] * 4, abs=2e-4)
+
+
+def test_a_display_hands_on_the_viewer_s_forces(device):
+    builder = new_builder()
+    add_ball(builder, (0.0, 0.0, 0.1))
+    model = builder.finalize(device=device)
+    magnetics, state = warpmag.Magnetics(model), model.state()
+    for viewer, force in ((Dragging(), -10.0), (Notes(), 0.0)):  # some of Newton's viewers pick nothing
+        state.clear_forces()
+        warpmag.Display(viewer, model, magnetics).apply_forces(state)
+        assert state.body_f.numpy()[0, 2] == force
+    with pytest.raises(warpmag.InputError, match="state: must be a newton.State"):
+        warpmag.Display(Notes(), model, magnetics).apply_forces(None)
 
 
 def test_a_viewer_sees_magnetizations_and_all_of_the_scene(scene, device, monkeypatch, tmp_path):

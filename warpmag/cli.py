@@ -273,7 +273,7 @@ def _run(options) -> int:
         if display:
             display.restart(simulation.model, simulation.magnetics)
         else:
-            display = _open_display(options.viewer, simulation)
+            options.display = display = _open_display(options.viewer, simulation)
         options.stopwatch.end_part("loading")
         _simulate(simulation, output, options, display, copy_scene=is_bundled, resume=resume)
         if not (display and display.restarted):
@@ -308,6 +308,8 @@ def _simulation_of(path: Path, options):
     settings["force"] = options.force or (preset and preset.force)
     settings["dynamics"] = options.dynamics or (preset and preset.dynamics)
     settings |= {"dt": options.step, "curve": preset and preset.curve, "visuals": options.viewer != "none"}
+    if options.viewer != "none":  # the mouse drags bodies; Newton's viewers launch kernels only
+        settings |= {"graphs": True, "on_substep": lambda state, _: options.display.apply_forces(state)}
     return _load(path, **settings)
 
 

@@ -39,6 +39,7 @@ class Display:
     starts where it sees all bodies. ::
 
         display = warpmag.Display(newton.viewer.ViewerGL(), model, magnetics)
+        display.apply_forces(state)  # in each substep: the mouse drags bodies
         display.show(time, state)
 
     Attributes:
@@ -128,6 +129,17 @@ class Display:
         if not isinstance(self.viewer, newton.viewer.ViewerNull):
             self._show_arrows(state)
         self.viewer.end_frame()
+
+    def apply_forces(self, state: newton.State) -> None:
+        """Add the viewer's forces, by which the mouse drags bodies, to ``state.body_f``; capturable in a graph.
+
+        Call it in each substep, after :meth:`Magnetics.apply`, or give it to a simulation:
+        ``Simulation(..., on_substep=lambda state, dt: display.apply_forces(state))``. Viewers without picking do
+        nothing.
+        """
+        check_state(state, self._model, "body_q", "body_f")
+        if hasattr(self.viewer, "apply_forces"):
+            self.viewer.apply_forces(state)
 
     def follow(self, time: float, state: newton.State) -> bool:
         """Show a state, and again while the viewer is paused.

@@ -16,6 +16,7 @@ from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.caller_checks import check_state, held_by_model
 from warpmag.engine.magnets.eddy import gather_velocities, set_conductivities
 from warpmag.engine.magnets.grouping import BodyMagnet, find_magnets
+from warpmag.engine.magnets.imported_field import imported_field
 from warpmag.engine.magnets.magnet_system import KINEMATIC, make_system
 from warpmag.engine.magnets.model_values import ModelValues, magnetic_arrays
 from warpmag.engine.magnets.sources import ModelSources
@@ -76,7 +77,7 @@ class Magnetics:
         contact_model: str = "dipole",
         method: str = "auto",
         rtol: float = 1e-3,
-        external_field: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        external_field: tuple[float, float, float] | None = None,
         max_evaluations: int = 1000,
         curve: str | MagnetizationCurve | None = None,
         dt: float = 1e-3,
@@ -94,7 +95,8 @@ class Magnetics:
             method: Summation of fields and forces: ``direct`` over all pairs, ``fmm`` by the fast multipole method
                 with an error within ``rtol``, or ``auto`` for the faster one.
             rtol: Relative magnetization error at which the induction solve ends.
-            external_field: Uniform applied field H0 [A/m], world frame.
+            external_field: Uniform applied field H0 [A/m], world frame. By default the option ``magnetic`` of an
+                imported MJCF, B/μ0, with a warning; else none.
             max_evaluations: Field evaluations after which an unconverged induction solve ends.
             curve: Magnetization curve of all magnets, see :func:`warpmag.add_inducible`; by default each magnet's own.
             dt: Longest time between calls of :meth:`apply` [s]. Drag by eddy currents is limited so that it stops no
@@ -105,6 +107,9 @@ class Magnetics:
                 in several.
         """
         self._held = held_by_model(model)
+        imported = None
+        if external_field is None:
+            external_field, imported = (0.0, 0.0, 0.0), imported_field(model)
         settings = MagneticSettings(external_field, force, dynamics, contact_model, rtol)
         if (all_ranks := current_ranks()) is not None:
             others = {"method": method, "max_evaluations": max_evaluations, "curve": curve, "dt": dt}
@@ -127,6 +132,8 @@ class Magnetics:
         self._sources.bind(self.system)
         self._map_bodies()
         set_conductivities(model, self.magnets, self.system, dt)
+        if imported is not None:
+            self.set_external_field(imported)
 
     @property
     def device(self) -> wp.Device:

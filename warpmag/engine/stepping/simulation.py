@@ -93,8 +93,9 @@ class Simulation:
         external_field: tuple[float, float, float] | None = None,
         curve: str | None = None,
         device: str | None = None,
-        graphs: bool = True,
+        graphs: bool | None = None,
         visuals: bool = False,
+        on_substep: Callable[[newton.State, float], object] | None = None,
     ):
         """Import the scene and prepare the first step.
 
@@ -110,18 +111,26 @@ class Simulation:
             method: Summation method: ``direct``, ``fmm`` or ``auto``, see :class:`warpmag.Magnetics`.
             rtol: Relative magnetization error at which the induction solve ends; by default the stage's, else 1e-3.
             max_evaluations: Field evaluations after which an unconverged induction solve ends.
-            external_field: Uniform applied field H0 [A/m]; by default the stage's, else none.
+            external_field: Uniform applied field H0 [A/m]; by default the stage's, else that of an imported MJCF (see
+                :class:`warpmag.Magnetics`), else none.
             curve: Magnetization curve of all magnets, one of ``magnets.CURVES``; by default each magnet's own.
             device: Warp device; by default Warp's.
-            graphs: Replay captured CUDA graphs, in place of launching each kernel.
+            graphs: Replay captured graphs, in place of launching each kernel; by default True without ``on_substep``.
             visuals: Also import visual shapes that do not collide, for a viewer.
+            on_substep: Function of a state and the length of a substep [s], called in each substep after the magnetic
+                forces: it adds its own to ``state.body_f``, or sets ``simulation.control``. A substep may be repeated,
+                so its effects must follow from the state. With ``graphs=True`` it may launch kernels only, since its
+                Python runs once.
 
         Raises:
             InputError: The scene or an argument is invalid; the message names the prim or the argument.
         """
         check_solver(solver)
+        graphs = on_substep is None if graphs is None else graphs
         for name, flag in (("graphs", graphs), ("visuals", visuals)):
             check_flag(name, flag)
+        if not (on_substep is None or callable(on_substep)):
+            raise InputError(f"on_substep: must be a function, got {short_repr(on_substep)}")
         self.device, self._ranks = resolve_device(device), current_ranks()
         graphs &= self._ranks is None  # sums over ranks cannot be captured
         overrides = {"force": force, "dynamics": dynamics, "contact_model": contact_model, "rtol": rtol}
@@ -134,8 +143,10 @@ class Simulation:
             self.step_size = float(time_step)
             self.model = self._finalize(builder, solver, scene)
             settings = settings.replaced(external_field=external_field, **overrides)
-            self._magnetics = Magnetics(self.model, dt=LONGEST_SUBSTEP, **solve_options, **vars(settings))
-            self._prepare(solver, graphs, self._keyed_values(solver, keyed_field=external_field is None))
+            magnetic = vars(settings) | ({"external_field": external_field} if self._scene is None else {})
+            self._magnetics = Magnetics(self.model, dt=LONGEST_SUBSTEP, **solve_options, **magnetic)
+            keyed_values = self._keyed_values(solver, keyed_field=external_field is None)
+            self._prepare(solver, graphs=graphs, keyed_values=keyed_values, on_substep=on_substep)
             self._options = self._options_of(settings, solver, **solve_options)
             if self._ranks is not None:
                 self._ranks.check_equal(self._options | {"scene": list(self._stepper.save().values())})
@@ -193,12 +204,11 @@ class Simulation:
             return None
         return KeyedModelValues(self.model, self._magnetics, keys, contacts_at_end=SOLVERS[solver].contacts_at_end)
 
-    def _prepare(self, solver: str, graphs: bool, keyed_values: KeyedModelValues | None) -> None:
-        """Set up solver and stepper, and measure overlaps at the start."""
+    def _prepare(self, solver: str, **stepping) -> None:
+        """Set up solver and stepper with its options ``stepping``, and measure overlaps at the start."""
         self._sizes = sizes = body_sizes(self.model)
         self._solver = RigidSolver(self.model, sizes, solver=solver)
-        options = {"step": self.step_size, "longest_substep": LONGEST_SUBSTEP, "graphs": graphs}
-        options["keyed_values"] = keyed_values
+        options = {"step": self.step_size, "longest_substep": LONGEST_SUBSTEP, **stepping}
         self._stepper = Stepper(self.model, self._magnetics, self._solver, sizes, **options)
         bodies = {magnet.body for magnet in self._magnetics.magnets if magnet.body >= 0}
         self._moving = np.array(sorted(body for body in bodies if math.isfinite(sizes.thickness[body])), dtype=int)

@@ -14,7 +14,7 @@ Steps that cannot be captured in a graph are launched from Python by the same co
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import newton
@@ -84,12 +84,15 @@ class Stepper:
         longest_substep: float,
         graphs: bool = True,
         keyed_values: KeyedModelValues | None = None,
+        on_substep: Callable[[newton.State, float], object] | None = None,
     ):
         """Allocate states and the state machine, for time steps and substeps of at most ``longest_substep`` [s].
 
-        ``graphs`` means to capture a step in a graph where the device and the solver allow it.
+        ``graphs`` means to capture a step in a graph where the device and the solver allow it. ``on_substep`` is called
+        with the state of each substep, which has its magnetic forces, and the length of the substep [s].
         """
         self._model, self._magnetics, self._solver = model, magnetics, solver
+        self._on_substep = on_substep
         self._keyed_values, self._device, self._step = keyed_values, wp.get_device(model.device), step
         # an even number, so that a step ends in the same state object as it begins
         self._min_substeps = 2 ** max(1, math.ceil(math.log2(step / longest_substep) - 1e-9))
@@ -330,8 +333,15 @@ class Stepper:
                 self._magnetize(now)
             else:
                 wp.copy(now.body_f, self._shared.body_f)
+            self._call_user(now, dt)
             self._move(now, then, half * dt, dt)
         machine.end_pair(level)
+
+    def _call_user(self, state: newton.State, dt: float) -> None:
+        """Let the user's function add forces, which limit the substep as magnetic ones do."""
+        if self._on_substep:
+            self._on_substep(state, dt)
+            monitor.watch_forces(self._watched, view_bodies(self._model, state), self._model.gravity, self._longest)
 
     def _move(self, now: newton.State, then: newton.State, begin: float, dt: float) -> None:
         """Run the solver for a substep of ``dt`` [s] that begins ``begin`` [s] after its pair of substeps."""

@@ -19,6 +19,7 @@ from warpmag.usd.read.geometry import magnet_findings, mesh_findings, shape_find
 from warpmag.usd.read.input_errors import first_line
 from warpmag.usd.read.keys import KeyReader, field_keys, magnetization_keys
 from warpmag.usd.read.materials import material_findings
+from warpmag.usd.read.mujoco_field import with_mujoco_field
 from warpmag.usd.read.opening import copied_metadata
 from warpmag.usd.read.prims import body_of, is_body, is_collider, is_solid, prims_of_magnet
 from warpmag.usd.read.session import instance_findings, instances_around, unsaved_layers
@@ -140,11 +141,12 @@ def _read_scene(stage, prims, keys, contents) -> None:
         contents.findings.append(Finding(str(prim.GetPath()), "one PhysicsScene of several: only the first is read"))
     for prim in physics_scenes[:1]:
         contents.findings += declaration_findings(prim)
-        if not has_api(prim, SCENE_API):
-            continue
         try:
-            contents.settings = settings_of(prim)
-            contents.field_keys = field_keys(prim, keys)
+            if has_api(prim, SCENE_API):
+                contents.settings = settings_of(prim)
+                contents.field_keys = field_keys(prim, keys)
+            contents.settings, warnings = with_mujoco_field(prim, contents.settings)
+            contents.findings += warnings
         except InputError as error:
             contents.findings.append(finding_of(str(prim.GetPath()), error))
 
