@@ -381,8 +381,8 @@ def test_bad_scenes_are_refused(device):
         Simulation(pile(), device=device, dt=0.0)
     with pytest.raises(warpmag.InputError, match="device: no 'cuda:99' here"):
         Simulation(pile(), device="cuda:99")
-    with pytest.raises(warpmag.InputError, match="only a scene from a stage"):
-        Simulation(pile(), device=device).run(1, output="out.usda")
+    with pytest.raises(warpmag.InputError, match="resume: needs an output, and a scene from a stage"):
+        Simulation(pile(), device=device).run(1, resume=True)
 
 
 def test_overlaps_at_the_start_are_counted(device):

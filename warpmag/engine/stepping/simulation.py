@@ -6,7 +6,6 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import newton
 import numpy as np
@@ -146,6 +145,7 @@ class Simulation:
             magnetic = vars(settings) | ({"external_field": external_field} if self._scene is None else {})
             self._magnetics = Magnetics(self.model, dt=LONGEST_SUBSTEP, **solve_options, **magnetic)
             keyed_values = self._keyed_values(solver, keyed_field=external_field is None)
+            self._builder, self._settings = builder, settings
             self._prepare(solver, graphs=graphs, keyed_values=keyed_values, on_substep=on_substep)
             self._options = self._options_of(settings, solver, **solve_options)
             if self._ranks is not None:
@@ -353,7 +353,7 @@ class Simulation:
 
         Args:
             frames: Output frames after the first; by default the whole stage, else one second.
-            output: USD file to write; only for a scene from a stage.
+            output: USD file to write. For a builder it has bodies, shapes and magnets, not joints, coils or field maps.
             copy_scene: Copy the scene beside the output instead of referencing it. A scene with unsaved edits is always
                 copied.
             resume: Continue the run at the output, if there is one; scene and options must be the same. On a CPU the
@@ -369,8 +369,8 @@ class Simulation:
         """
         frames = self.frames_of(frames)
         recorder = None if output is None else self._open_recorder(output, copy_scene, frames)
-        if resume and recorder is None:
-            raise InputError("resume: needs an output")
+        if resume and (recorder is None or self._scene is None):
+            raise InputError("resume: needs an output, and a scene from a stage")
         if resume and self._stepper.steps:
             raise ValueError("only a simulation that has not begun can resume another")
         if resume and not SOLVERS[self._options["solver"]].resumable:
@@ -432,13 +432,18 @@ class Simulation:
         return frames
 
     def _open_recorder(self, output: str | os.PathLike, copy_scene: bool, frames: int):
-        if self._scene is None:
-            raise InputError(f"{Path(output)}: only a scene from a stage can be written to a stage")
         from warpmag.engine.stepping.recording import Recorder  # noqa: PLC0415 - a builder can do without USD
 
+        scene = self._scene
+        if scene is None:
+            from warpmag.engine.stepping.builder_scene import builder_scene  # noqa: PLC0415
+
+            field = self._magnetics.external_field.numpy()[0].tolist()  # of the first world
+            settings = self._settings.replaced(external_field=tuple(field))
+            scene = builder_scene(self._builder, self.model, self.state, settings, self.frame_rate)
         options = {"copy_scene": copy_scene, "frames": frames + 1, "options": self._options, "ranks": self._ranks}
-        options["resumable"] = SOLVERS[self._options["solver"]].resumable
-        return Recorder(self._scene, self._magnetics, self._stepper, self._statistics, output, **options)
+        options["resumable"] = SOLVERS[self._options["solver"]].resumable and self._scene is not None
+        return Recorder(scene, self._magnetics, self._stepper, self._statistics, output, **options)
 
     def _steps_at(self, frame: int) -> int:
         """Return the number of steps before a frame."""
