@@ -22,6 +22,7 @@ from warpmag.kernels.applied.sources import AppliedSource, SourceKind
 from warpmag.kernels.contacts import solve as contact_solve
 from warpmag.kernels.fmm import expansions, sharing
 from warpmag.kernels.induction.solve_state import BLOCK_CHUNK
+from warpmag.kernels.near_contact.images import IronFaces
 from warpmag.kernels.pairs import evaluate, fused_cuda, mirror_cuda, sums_cuda
 from warpmag.kernels.pairs.evaluate import FUSED, GIVEN, LOOP, MIRRORED, REFERENCE, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
@@ -29,7 +30,7 @@ from warpmag.kernels.pairs.pair_law import WIDTHS, Quantity
 from warpmag.moments import fmm, system
 from warpmag.moments.probe import FieldProbe
 from warpmag.moments.system import MomentSystem
-from warpmag.shapes import demagnetization, lattice, polyhedra
+from warpmag.shapes import demagnetization, flat_faces, lattice, polyhedra
 
 pytestmark = [
     pytest.mark.skipif("not config.getoption('--device') == 'cpu'"),
@@ -269,6 +270,16 @@ def cells(spacing: float) -> dict:
     return {"radii": body.radii, "bodies": np.zeros(len(body.radii), int), "couplings": [(0, coupling)]}
 
 
+def ball_on_box(spacing: float) -> dict:
+    """Arguments of a system with a body of cells and a ball, which has images in its faces."""
+    body = cells(spacing)
+    faces = flat_faces.faces_of_polyhedron(polyhedra.box(BOX), 6)
+    count = len(body["radii"])
+    iron = IronFaces(0, 0, count, 0, body["couplings"][0][1].positions[0], faces.planes, faces.edges)
+    radii, bodies = np.append(body["radii"], 0.005), np.append(body["bodies"], 1)
+    return body | {"radii": radii, "bodies": bodies, "faces": [iron], "contact_model": "multipole"}
+
+
 MANY = {"radii": np.full(40, 0.005), "worlds": np.repeat([0, 1], 20), "permanent": np.arange(40) % 20 > 16}
 SYSTEMS = {
     "balls": MANY,
@@ -279,6 +290,7 @@ SYSTEMS = {
     "yielding": MANY | {"contact_model": "multipole", "curve": ["linear"] * 40},
     "cells": cells(0.005),
     "whole": cells(0.02),
+    "images": ball_on_box(0.005),
     "coils": MANY | {"sources": [COIL, LINES], "contact_model": "multipole"},
     "solids": MANY | {"solids": [solid(18)], "sources": [COIL]},
     "fast": MANY | {"method": "fmm"},
@@ -303,6 +315,7 @@ EXPECTED = {
     "yielding": {"sum_tile", "finish", "begin_flow", "add_bias"},
     "cells": {"sum_and_finish", "add_couplings", "sweep"},
     "whole": {"sum_and_finish", "add_couplings", "respond_all"},
+    "images": {"make_passes", "add_couplings", "add_reactions"},
     "coils": {"sum_tile", "apply_sources", "add_forces", "add_to_probe", "add_eddy_moments"},
     "solids": {"sum_and_finish", "apply_sources", "add_forces", "add_to_probe", "add_eddy_moments"},
     "fast": {"build_octree", "sum_leaf", "translate_block", "add_parts", "expansion_step", "return_sums"},
