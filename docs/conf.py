@@ -30,6 +30,7 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 
 autodoc_member_order = "bysource"
+autodoc_mock_imports = ["isaaclab", "isaaclab_newton", "torch"]
 autodoc_typehints = "none"  # docstrings state shapes and units, which types do not
 maximum_signature_line_length = 90
 autodoc_preserve_defaults = True

@@ -1,5 +1,6 @@
 """The documents: their Python runs, what they say of schemas and commands is so, and every public name is described."""
 
+import importlib.util
 import re
 import runpy
 import shlex
@@ -20,6 +21,9 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(page for page in DOCS.rglob("*.md") if "paper" not in page.parts)]
 SNIPPET = re.compile(r"^(?:```python|<!-- python)\n(.*?)^(?:```|-->)$", re.MULTILINE | re.DOTALL)
 """A block of Python; in a comment it is what a page leaves to its reader, such as the model that it speaks of."""
+IMPORT = re.compile(r"^(?:import|from) (\w+)", re.MULTILINE)
+MISSING = {name for name in ("torch", "isaaclab") if importlib.util.find_spec(name) is None}
+"""Libraries of some pages that the tests do not install; ``.ci/isaaclab`` runs these pages with them."""
 STAGE = re.compile(r"^```\n(#usda 1\.0\n# (\S+)\n.*?)^```$", re.MULTILINE | re.DOTALL)
 """A whole stage and the file to save it as."""
 COMMAND = re.compile(r"^(?:pip install uv && uv run )?(warpmag .*)$", re.MULTILINE)
@@ -28,9 +32,11 @@ SLOW = ("physics.md", "howto/coils.md", "howto/holding.md", "howto/mujoco.md", "
 
 
 def program(page: Path) -> str:
-    """The Python of a page, each line where it is on the page."""
+    """Return the Python of a page, each line at its place, up to a block that imports a library not installed here."""
     text, lines = page.read_text(encoding="utf-8"), []
     for snippet in SNIPPET.finditer(text):
+        if any(library in MISSING for library in IMPORT.findall(snippet[1])):
+            break
         lines += [""] * (text.count("\n", 0, snippet.start(1)) - len(lines))
         lines += snippet[1].splitlines()
     return "\n".join(lines)

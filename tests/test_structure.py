@@ -37,14 +37,22 @@ REPEATED = {
 }
 """Public names that several modules may have, and why."""
 OWNERS = {
-    "newton": ("warpmag/engine", "warpmag/show", "warpmag/examples", "warpmag/cli.py"),  # the command opens viewers
+    "newton": (  # the command opens viewers
+        *("warpmag/engine", "warpmag/show", "warpmag/examples", "warpmag/cli.py"),
+        "warpmag/isaaclab.py",
+    ),
     "newton._src": ("warpmag/engine/pile_xpbd",),
     "warp._src": ("warpmag/engine/pile_xpbd",),
     "pxr": ("warpmag/usd", "warpmag/show"),
     "warp": (
         *("warpmag/moments", "warpmag/engine", "warpmag/show", "warpmag/examples"),
         *("warpmag/terminal.py", "warpmag/kernel_loading.py"),
+        *("warpmag/isaaclab.py", "warpmag/torch.py", "warpmag/jax.py"),
     ),
+    "isaaclab": ("warpmag/isaaclab.py",),
+    "isaaclab_newton": ("warpmag/isaaclab.py",),
+    "torch": ("warpmag/isaaclab.py", "warpmag/torch.py"),
+    "jax": ("warpmag/jax.py",),
     "bench": (),
     "tests": (),
 }

@@ -217,6 +217,10 @@ class CellPairs:
         ranges = [(k, k + 1) for k in range(first, last + 1)] if device.is_cuda else [(first, last + 1)]
         return [launch_passes(kernel, *ends, pairs, device=device, record_cmd=True, **sizes) for ends in ranges]
 
+    def request_search(self, chosen):
+        """Search again, and compute all tensors again, in the next :meth:`find` if any entry of ``chosen`` is not 0."""
+        neighbors.launch_request_search(self._lists, chosen)
+
     def find(self):
         """Launch the search for near cells, and compute the tensors of pairs that have moved."""
         for launch in self._locate:

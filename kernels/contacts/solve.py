@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.rigid.newton_views import BodyView, ContactView
+from warpmag.kernels.rigid.worlds import is_chosen
 from warpmag.kernels.shared.native import CHUNK, LINE, native_kernel
 from warpmag.kernels.shared.team import team, threads_for
 
@@ -133,6 +134,20 @@ class SolveBuffers:
     def persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays that a substep hands on to the next one, by name."""
         return {name: self.work[name] for name in ("kept_range", "kept_key", "kept")}
+
+
+@wp.kernel(enable_backward=False)
+def _forget_slips(mask_in: wp.array[wp.bool], world_in: wp.array[wp.int32], kept_range_out: wp.array2d[wp.int32]):
+    body = wp.tid()
+    if is_chosen(mask_in, world_in[body]):
+        kept_range_out[body, 0] = 0
+        kept_range_out[body, 1] = 0
+
+
+def launch_forget_slips(buffers: SolveBuffers, mask, body_world):
+    """Discard the slips of sticking contacts in the worlds that a complete mask chooses (``rigid.worlds``)."""
+    inputs, outputs = [mask, body_world], [buffers.work["kept_range"]]
+    wp.launch(_forget_slips, len(body_world), inputs=inputs, outputs=outputs, device=mask.device)
 
 
 def allocate(contact_max: int, bodies: BodyView, *, kinematic_flag: int) -> SolveBuffers:

@@ -165,6 +165,24 @@ def bind(state, packed, material, moments, rtol: float, max_evaluations: int) ->
     state.rtol, state.max_evaluations = rtol, max_evaluations
 
 
+@cache
+def _cold_kernel(dtype):
+    @wp.kernel(module="unique", enable_backward=False)
+    def start_cold(chosen: wp.array[int], state: state_type(dtype)):
+        w = wp.tid()
+        if chosen[w] != 0:
+            state.warm[w] = 0
+            state.worlds[w] = World()
+
+    return start_cold
+
+
+def launch_start_cold(state, chosen):
+    """Discard the last solutions of worlds where ``chosen`` is not 0, shape [w]: their next solve starts cold."""
+    kernel = _cold_kernel(state.packed.dtype)
+    wp.launch(kernel, dim=len(chosen), inputs=[chosen, state], device=chosen.device)
+
+
 @wp.func
 def is_last_of_world(lane: int, w: int, chunks: int, arrived: wp.array[int]):
     """Return true in the last block that sums one of the ``chunks`` of world ``w``; it can read all sums."""

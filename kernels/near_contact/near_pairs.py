@@ -164,14 +164,35 @@ class NearContactBuffers:
         """The Warp device."""
         return self.arrays.group.device
 
-    def reset(self):
-        """Set the contact sources to zero, so that the next solve starts cold."""
-        for name in _START_ARRAYS:
-            getattr(self.arrays, name).zero_()
+    def start_cold(self, chosen):
+        """Set the contact sources to zero in worlds where ``chosen`` is not 0, shape [worlds]."""
+        neighbors.launch_request_search(self.lists, chosen)
+        wp.launch(_cold_kernel(self.dtype), self.arrays.balls, inputs=[chosen, self.arrays], device=self.device)
 
     def persistent_arrays(self) -> dict:
         """Return the arrays that persist from one solve to the next, by name."""
         return neighbors.persistent_lists(self.lists) | {name: getattr(self.arrays, name) for name in _START_ARRAYS}
+
+
+@cache
+def _cold_kernel(dtype):
+    @wp.kernel(module="unique", enable_backward=False)
+    def start_cold(chosen: wp.array[int], a: contact_arrays(dtype)):
+        i = wp.tid()
+        world = a.group[i]
+        if world < 0:
+            return
+        if chosen[world] == 0:
+            return
+        chunk = i // wp.static(CHUNK)
+        lane = i % wp.static(CHUNK)
+        for row in range(a.state.shape[1]):
+            a.state[chunk, row, lane] = dtype(0.0)
+            a.last_state[chunk, row, lane] = dtype(0.0)
+        for entry in range(a.sources.shape[1]):
+            a.sources[i, entry] = dtype(0.0)
+
+    return start_cold
 
 
 def allocate(

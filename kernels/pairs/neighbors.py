@@ -104,6 +104,17 @@ def persistent_lists(lists) -> dict:
     return {name: getattr(lists, name) for name in ("neighbor", "count", "found_at", "moved", "searching")}
 
 
+@wp.kernel(enable_backward=False)
+def _request_search(chosen: wp.array[int], moved: wp.array[int]):
+    if chosen[wp.tid()] != 0:
+        moved[0] = 1
+
+
+def launch_request_search(lists, chosen):
+    """Rebuild the lists in the next search if any entry of ``chosen`` is not 0, as if a moment had moved too far."""
+    wp.launch(_request_search, len(chosen), inputs=[chosen], outputs=[lists.moved], device=chosen.device)
+
+
 @cache
 def _kernel(call: str, header: str, dtype, capacity: int, group: int):
     arguments = {"threads": int, "team": wp.array2d[wp.uint64]}

@@ -119,6 +119,10 @@ class PackedMoments:
         """Return the arrays that the next search reads, by name."""
         return neighbors.persistent_lists(self._lists)
 
+    def request_search(self, chosen):
+        """Rebuild the lists in the next search if any entry of ``chosen`` is not 0."""
+        neighbors.launch_request_search(self._lists, chosen)
+
     def pack(self, positions, moments):
         """Pack positions [m] and moments [A·m²], Warp arrays of vectors, shape [n]."""
         if self.count:

@@ -8,6 +8,7 @@
 | keys, keyed_poses | time-sampled values, and poses of kinematic bodies that follow them |
 | monitor | largest motion, penetration, buffer use and induction error of a substep |
 | stepping | state machine of a step: length of substeps, attempts, log |
+| worlds | masks of worlds that start again, and rows of arrays that return to earlier values |
 
 May import ``shared`` and ``pairs``. Contacts and joints are in ``contacts``.
 """

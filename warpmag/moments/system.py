@@ -20,7 +20,7 @@ from warpmag.kernels.fmm.evaluation import sampled_error
 from warpmag.kernels.induction import solve_state
 from warpmag.kernels.induction.body_response import MOST_CELLS, BodyResponses, RespondingBody
 from warpmag.kernels.induction.energy import launch_energy
-from warpmag.kernels.induction.solve_state import launch_add_bias
+from warpmag.kernels.induction.solve_state import launch_add_bias, launch_start_cold
 from warpmag.kernels.material.curves import LINEAR
 from warpmag.kernels.near_contact import near_pairs, nonuniform
 from warpmag.kernels.near_contact.images import IronFaces
@@ -337,11 +337,22 @@ class MomentSystem:
         """Relative error of the magnetization at which a solve ends."""
         return float(self.settings.rtol)
 
-    def start_cold(self):
-        """Start the next solve from zero magnetization in every world."""
-        self._induction.warm.zero_()
+    def start_cold(self, chosen: wp.array | None = None):
+        """Start the next solve as the first one, from zero magnetization, in chosen worlds.
+
+        ``chosen`` is not 0 for these worlds, int32, shape [worlds]; None means all worlds. Neighbor lists are rebuilt
+        in all worlds.
+        """
+        if not self.count:
+            return
+        if chosen is None:
+            chosen = wp.ones(len(self.world_ranges), dtype=wp.int32, device=self.device)
+        launch_start_cold(self._induction, chosen)
+        self._packed.request_search(chosen)
         if self._near is not None:
-            self._near.reset()
+            self._near.start_cold(chosen)
+        if self._cell_pairs is not None:
+            self._cell_pairs.request_search(chosen)
 
     def start_from(self, magnetizations):
         """Start the next solve from given magnetizations [A/m], a Warp array of vectors, shape [n]."""

@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import replace
+from typing import Any
 
 import newton
 import numpy as np
@@ -21,6 +22,7 @@ from warpmag.engine.magnets.imported_field import imported_field
 from warpmag.engine.magnets.magnet_system import KINEMATIC, make_system
 from warpmag.engine.magnets.model_values import ModelValues, magnetic_arrays
 from warpmag.engine.magnets.sources import ModelSources
+from warpmag.engine.magnets.world_reset import WorldMask, WorldRows
 from warpmag.errors import ConvergenceWarning, InputError
 from warpmag.kernels.rigid.bodies import (
     BodyMoments,
@@ -33,6 +35,7 @@ from warpmag.kernels.rigid.bodies import (
     set_magnetization,
     sum_moments,
 )
+from warpmag.kernels.rigid.worlds import choose
 from warpmag.moments.arrays import (
     CallContext,
     Numbers,
@@ -132,6 +135,7 @@ class Magnetics:
         )
         self._sources.bind(self.system)
         self._map_bodies()
+        self._prepare_reset()
         set_conductivities(model, self.magnets, self.system, float(dt))
         if imported is not None:
             self.set_external_field(imported)
@@ -239,6 +243,43 @@ class Magnetics:
         shapes = shapes[np.argsort(shape_body[shapes], kind="stable")]
         self._permanent_shapes, self._permanent_list = shapes, put(shapes, wp.int32)
         self._permanent_bodies = shape_body[shapes]
+
+    def _prepare_reset(self) -> None:
+        """Copy the values to which :meth:`reset` returns."""
+        model, attributes = self._model, getattr(self._model, NAMESPACE)
+        self._mask, shape_worlds = WorldMask(model), model.shape_world.numpy()[: model.shape_count]
+        self._system_worlds = wp.array(self._worlds, dtype=wp.int32, device=model.device)
+        self._chosen_worlds = wp.zeros_like(self._system_worlds)
+        self._initial_values = [
+            WorldRows(attributes.magnetization, shape_worlds),
+            WorldRows(attributes.strength, shape_worlds),
+            WorldRows(self.external_field, self._worlds[self.system.worlds]),
+        ]
+
+    def reset(self, worlds: Any = None) -> None:
+        """Start worlds again, as after :class:`Magnetics` was made; capturable in a graph with an array on the device.
+
+        Their next induction starts from zero magnetization. Their coil currents, factors of field maps, magnetizations
+        and external fields return to the values from which this object was made; set others afterwards. The state with
+        the poses, changed materials and the other worlds stay. Neighbor lists of touching magnets are rebuilt in all
+        worlds, which may change later results of the others within ``rtol``::
+
+            done = wp.array([True, False, False], dtype=wp.bool)  # or a tensor of torch
+            magnetics.reset(worlds=done)
+
+        Args:
+            worlds: True for each world to reset, shape [worlds], or [worlds + 1] as for Newton's solvers, with a last
+                entry for magnets outside all worlds. A Warp array of bool or a tensor of bool on the model's device,
+                NumPy's bools or a list of bools; by default all worlds.
+
+        Raises:
+            InputError: ``worlds`` is not such a mask.
+        """
+        self._mask.set(worlds)
+        for rows in self._initial_values:
+            rows.restore(self._mask)
+        choose(self._mask.array, self._system_worlds, self._chosen_worlds)
+        self.system.start_cold(self._chosen_worlds)
 
     def apply(self, state: newton.State) -> None:
         """Add the magnetic forces at the poses of ``state`` to ``state.body_f``; capturable in a graph.

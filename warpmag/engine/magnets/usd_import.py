@@ -10,6 +10,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag.declarations.magnets import Magnet
 from warpmag.engine.magnets.attributes import NAMESPACE, declare_attributes, stored_values
 from warpmag.engine.magnets.declared_magnets import axis_rotation, in_shape_frame
 from warpmag.engine.magnets.declared_sources import add_placed_source
@@ -40,16 +41,22 @@ register_attributes = register_custom_attributes
 
 def _attribute_value(_, context: dict[str, Any]) -> Any:
     """Return the value of one attribute for the shape of a prim, None if the shape is not a magnet."""
+    magnet = shape_magnet(context["prim"])
+    return None if magnet is None else stored_values(magnet)[context["attr"].name]
+
+
+def shape_magnet(prim: Any) -> Magnet | None:
+    """Return the magnet of a collider in the frame of Newton's shape, None if the collider is not a magnet."""
     from warpmag.usd import collider_magnet  # noqa: PLC0415 - a builder can do without USD
 
-    collider = collider_magnet(context["prim"])
+    collider = collider_magnet(prim)
     if collider is None:
         return None
     rotation = axis_rotation(collider.axis)
     if collider.frames:
         magnet_rotation, shape_rotation = (_transform(matrix).q for matrix in collider.frames)
         rotation = wp.quat_inverse(magnet_rotation) * shape_rotation * rotation
-    return stored_values(in_shape_frame(collider.magnet, rotation))[context["attr"].name]
+    return in_shape_frame(collider.magnet, rotation)
 
 
 def _transform(matrix: np.ndarray) -> wp.transform:

@@ -77,6 +77,11 @@ class NeighborBroadPhase(newton.geometry.BroadPhaseSAP):
         lists = self._search.arrays.lists
         return persistent_lists(lists) | {"packed": lists.packed}
 
+    def request_search(self) -> None:
+        """Rebuild the neighbor lists in the next search."""
+        if self._search is not None:
+            self._search.arrays.lists.moved.fill_(1)
+
     def launch(self, shape_lower, shape_upper, shape_gap, shape_collision_group, shape_world, shape_count,
                candidate_pair, candidate_pair_count, **options) -> None:  # fmt: skip
         """List the pairs; takes the arguments of Newton's sweep."""

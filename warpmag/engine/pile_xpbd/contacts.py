@@ -207,6 +207,16 @@ class RigidSolver:
         solver = self._solver.persistent_arrays() if isinstance(self._solver, PileXPBD) else {}
         return self._broad_phase.persistent_arrays() | solver
 
+    def reset(self, state: newton.State, mask: wp.array) -> None:
+        """Discard what the next substep would reuse of the last one, in chosen worlds; capturable in a graph.
+
+        ``mask`` is True for these worlds, with Newton's last entry for everything outside all worlds.
+        """
+        self._broad_phase.request_search()
+        if isinstance(self._solver, PileXPBD):
+            self._solver.forget(mask)
+        self._solver.reset(state, world_mask=mask, flags=0)
+
     def collide(self, state: newton.State, dt: float) -> None:
         """Find the contacts at ``state`` and the contacts expected within ``dt`` [s]; capturable in a graph."""
         self._broad_phase.set_motion(state, dt)

@@ -88,6 +88,11 @@ class PileXPBD(newton.solvers.SolverXPBD):
         """Return the arrays that the next substep depends on, by name."""
         return {} if self._solve is None else self._solve.persistent_arrays()
 
+    def forget(self, mask: wp.array) -> None:
+        """Discard what the next substep would reuse of the last one, in worlds that a complete mask chooses."""
+        if self._solve is not None:
+            contact_solve.launch_forget_slips(self._solve, mask, self.model.body_world)
+
     def _step_bodies(self, state_in, state_out, control, contacts, dt) -> None:
         assert self._solve is not None
         before, after = self._view_bodies(state_in), self._view_bodies(state_out)

@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import newton
 import numpy as np
@@ -307,6 +308,25 @@ class Simulation:
         self._stepper.advance()
         if self._stepper.reports_due:
             self._read_reports()
+
+    def reset(self, worlds: Any = None) -> None:
+        """Return worlds to the start: poses, velocities, induction, currents, fields; capturable in a graph.
+
+        :attr:`time` and time-sampled values go on, and :attr:`control` stays. See :meth:`Magnetics.reset` for what
+        happens to magnets. Worlds share the length of substeps, which depends on the fastest motion in any world::
+
+            simulation.reset(worlds=[True, False, False])
+
+        Args:
+            worlds: True for each world to reset, see :meth:`Magnetics.reset`; by default all worlds.
+
+        Raises:
+            InputError: ``worlds`` is not such a mask.
+            SimulationError: A step led to a state that is not finite. Call this method again to go on.
+        """
+        if not wp.get_device(self.model.device).is_capturing:
+            self._read_reports()
+        self._stepper.reset(worlds)
 
     def _read_reports(self) -> None:
         """Add the reports of the last steps to the statistics; waits for the device."""

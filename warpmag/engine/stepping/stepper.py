@@ -16,6 +16,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import newton
 import numpy as np
@@ -23,9 +24,11 @@ import warp as wp
 
 from warpmag.engine.magnets.caller_checks import HeldArrays
 from warpmag.engine.magnets.magnetics import Magnetics
+from warpmag.engine.magnets.world_reset import WorldMask
 from warpmag.engine.pile_xpbd.capture import Workspace, without_allocations
 from warpmag.engine.pile_xpbd.contacts import BodySizes, RigidSolver
 from warpmag.engine.stepping.keyed_values import KeyedModelValues
+from warpmag.engine.stepping.state_rows import state_rows
 from warpmag.errors import InputError, SimulationError
 from warpmag.kernels.rigid import monitor, stepping
 from warpmag.kernels.rigid.bodies import predict_poses
@@ -121,6 +124,7 @@ class Stepper:
         self.steps = self._reported = 0
         if keyed_values:
             keyed_values.pose_for_contacts(self._state, 0.0, self._longest)
+        self._mask, self._initial_rows = WorldMask(model), state_rows(model, self._state)
         self._prepare()
 
     def _prepare(self) -> None:
@@ -150,6 +154,18 @@ class Stepper:
     def reports_due(self) -> bool:
         """True if :meth:`read_reports` has to be called before the next step."""
         return self.steps - self._reported >= (1 if self._device.is_cpu else _RECORDS)
+
+    def reset(self, worlds: Any) -> None:
+        """Return chosen worlds to the start, see :class:`WorldMask`; only launches kernels.
+
+        Call :meth:`read_reports` first.
+        """
+        self._mask.set(worlds)
+        for rows in self._initial_rows:
+            rows.restore(self._mask)
+        self._solver.reset(self._state, self._mask.array)
+        self._magnetics.reset(self._mask.array)
+        self._machine.invalidate_contacts()
 
     def advance(self) -> None:
         """Advance :attr:`state` by one step; does not wait for a GPU.
