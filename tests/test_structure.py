@@ -39,7 +39,7 @@ REPEATED = {
 OWNERS = {
     "newton": ("warpmag/engine", "warpmag/show", "warpmag/examples", "warpmag/cli.py"),  # the command opens viewers
     "newton._src": ("warpmag/engine/pile_xpbd",),
-    "warp._src": ("warpmag/engine/pile_xpbd",),
+    "warp._src": ("warpmag/engine/pile_xpbd", "warpmag/moments/tape.py"),  # the active tape
     "pxr": ("warpmag/usd", "warpmag/show"),
     "warp": ("warpmag/moments", "warpmag/engine", "warpmag/show", "warpmag/examples", "warpmag/terminal.py"),
     "bench": (),

@@ -109,6 +109,7 @@ class MomentSystem:
         material: The material as kernels read it.
         dynamics: Magnetization dynamics of the inducible moments (``moments.dynamics``).
         is_fast: True if the fast multipole method sums the pairs.
+        fmm_rtol: Relative error of the fields by the fast multipole method; None without it.
         worlds: World of each moment, NumPy, shape [n].
         world_ranges: (First moment, first permanent moment, end) of each world.
         h: Field at the inducible moments [A/m], without a moment's own field, with the bias, shape [n]. The
@@ -157,7 +158,7 @@ class MomentSystem:
         self._make_sources(layout, sources, solids)
         rotatable = ~layout.aligned | settings.single_torque
         self._fast = fast_sums_for(settings.method, self._packed, layout, body_extent, float(settings.rtol))
-        self.is_fast = isinstance(self._fast, SystemSums)
+        self.is_fast, self.fmm_rtol = isinstance(self._fast, SystemSums), self._fast.rtol
         self._make_field(layout, near)
         self._make_cells(layout, couplings, {solid.first for solid in solids}, responses=theta)
         self._make_wrench(layout, rotatable)
@@ -307,6 +308,11 @@ class MomentSystem:
     def count(self) -> int:
         """Number of moments n."""
         return self._packed.count
+
+    @property
+    def overlaps(self) -> bool:
+        """True if any balls overlapped in the last solve. Waits for the device."""
+        return bool(self._packed.overlap_counts.numpy().any())
 
     @property
     def rtol(self) -> float:
