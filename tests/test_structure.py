@@ -41,7 +41,12 @@ OWNERS = {
     "newton._src": ("warpmag/engine/pile_xpbd",),
     "warp._src": ("warpmag/engine/pile_xpbd", "warpmag/moments/tape.py"),  # the active tape
     "pxr": ("warpmag/usd", "warpmag/show"),
-    "warp": ("warpmag/moments", "warpmag/engine", "warpmag/show", "warpmag/examples", "warpmag/terminal.py"),
+    "warp": (
+        *("warpmag/moments", "warpmag/engine", "warpmag/show", "warpmag/examples", "warpmag/terminal.py"),
+        *("warpmag/torch.py", "warpmag/jax.py"),
+    ),
+    "torch": ("warpmag/torch.py",),
+    "jax": ("warpmag/jax.py",),
     "bench": (),
     "tests": (),
 }
