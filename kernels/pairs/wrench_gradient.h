@@ -27,40 +27,54 @@ template <class N> CUDA_CALLABLE inline N averaged_fourth_factor(N d, N a, N b, 
 }
 
 // Pair of a target and a source: direction u, distance d, and the factors g1, g2 d², g2 d, g3 d³, g2, g3 d² and g4 d⁴.
+// All are zero at zero distance, so for a moment and itself, except that overlapping ``others`` have a g1.
 struct DifferentiatedPair {
     Vector u;
     Number g1, g2_d2, g2_d, g3_d3, g2, g3_d2, g4_d4;
 };
-CUDA_CALLABLE inline DifferentiatedPair differentiated_pair(Vector r, Number a, Number b) {
-    const Polar at = polar(r);
-    const Number zero = Number(Real(0)), d = at.d, i = d > zero ? 1 / d : zero, i2 = i * i, i3 = i2 * i;
+CUDA_CALLABLE inline DifferentiatedPair differentiated_pair(Vector r, Number a, Number b, Mask others) {
+    const Number d2 = dot(r, r), contact = a + b, zero = Number(Real(0));
+    Number i = d2 > zero ? Real(0.5) * twice_inverse_root(d2) : zero;
+    Number d = i * d2, i2 = i * i, i3 = i2 * i, fourth = 105 * i3 * i2;
+    Vector u = i * r;
     Factors<Number> g = {-i3, 3 * i3 * i, -15 * i3 * i};
-    Number fourth = 105 * i3 * i2;
-    const Mask overlapping = d < a + b;
+    const Mask overlapping = others & (d2 < contact * contact);
     if (any(overlapping)) {
-        const Number apart = larger(a - b, b - a);
-        const Factors<Number> averaged = averaged_factors(d, a, b, apart);
-        const Number averaged_fourth = averaged_fourth_factor(d, a, b, apart);
+        const Polar at = polar(r);
+        const Number apart = larger(a - b, b - a), inverse = at.d > zero ? 1 / at.d : zero;
+        const Factors<Number> averaged = averaged_factors(at.d, a, b, apart);
+        const Number averaged_fourth = averaged_fourth_factor(at.d, a, b, apart);
         g.g1 = overlapping ? averaged.g1 : g.g1, g.g2 = overlapping ? averaged.g2 : g.g2;
         g.g3 = overlapping ? averaged.g3 : g.g3, fourth = overlapping ? averaged_fourth : fourth;
+        d = overlapping ? at.d : d, i = overlapping ? inverse : i;
+        u = {overlapping ? at.u.x : u.x, overlapping ? at.u.y : u.y, overlapping ? at.u.z : u.z};
     }
-    return {at.u, g.g1, g.g2 * d, g.g2, g.g3, g.g2 * i, g.g3 * i, fourth};
+    return {u, g.g1, g.g2 * d, g.g2, g.g3, g.g2 * i, g.g3 * i, fourth};
 }
 
-// 4π times the tensors of second, third and fourth derivatives, contracted with vectors but for one index.
-CUDA_CALLABLE inline Vector second(const DifferentiatedPair& p, Vector m) {
-    return p.g1 * m + p.g2_d2 * dot(p.u, m) * p.u;
-}
-CUDA_CALLABLE inline Vector third(const DifferentiatedPair& p, Vector m, Vector e) {
-    const Number um = dot(p.u, m), ue = dot(p.u, e);
-    return p.g2_d * (ue * m + um * e) + (p.g2_d * dot(m, e) + p.g3_d3 * um * ue) * p.u;
-}
-CUDA_CALLABLE inline Vector fourth(const DifferentiatedPair& p, Vector c, Vector m, Vector e) {
-    const Number uc = dot(p.u, c), um = dot(p.u, m), ue = dot(p.u, e), cm = dot(c, m), ce = dot(c, e), me = dot(m, e);
-    const Number radial = p.g4_d4 * uc * um * ue + p.g3_d2 * (cm * ue + ce * um + me * uc);
-    return radial * p.u + (p.g3_d2 * um * ue + p.g2 * me) * c + (p.g3_d2 * uc * ue + p.g2 * ce) * m
-           + (p.g3_d2 * uc * um + p.g2 * cm) * e;
-}
+// Sums over the sources of a target, 4π times the field and both gradients. Terms along the target's m and v = b × m
+// are summed as factors.
+struct WrenchGradient {
+    Vector field = {0, 0, 0}, by_moment = {0, 0, 0}, by_position = {0, 0, 0};
+    Number along_m = 0, along_v = 0;
+
+    // Adds a pair with the target's m and v, the source's moment n and w = b × n, and the difference c of both a.
+    CUDA_CALLABLE void add(const DifferentiatedPair& p, Vector c, Vector m, Vector v, Vector n, Vector w) {
+        const Vector u = p.u;
+        const Number uc = dot(u, c), um = dot(u, m), un = dot(u, n), uv = dot(u, v), uw = dot(u, w), cm = dot(c, m);
+        const Number cn = dot(c, n), mn = dot(m, n), g2_un = p.g2_d * un, g2_uc = p.g2_d * uc, g3_un = p.g3_d2 * un;
+        field += p.g1 * n + p.g2_d2 * un * u;
+        // D3[c, n] + D2[w]
+        by_moment += (p.g2_d * cn + p.g3_d3 * uc * un + p.g2_d2 * uw) * u + g2_un * c + g2_uc * n + p.g1 * w;
+        // D4[c, m, n] + D3[v, n] + D3[m, w]
+        const Number by_u = p.g4_d4 * uc * um * un + p.g3_d2 * (cm * un + cn * um + mn * uc)
+                            + p.g2_d * (dot(v, n) + dot(m, w)) + p.g3_d3 * (uv * un + um * uw);
+        by_position += by_u * u + (g3_un * um + p.g2 * mn) * c + (p.g3_d2 * uc * um + p.g2 * cm + p.g2_d * uv) * n
+                       + p.g2_d * um * w;
+        along_m += g3_un * uc + p.g2 * cn + p.g2_d * uw;
+        along_v += g2_un;
+    }
+};
 
 // Vector number j of an array, in all lanes.
 CUDA_CALLABLE inline Vector vector_of_all(const Real* vectors, int j) {
@@ -94,17 +108,15 @@ template <class Arrays> CUDA_CALLABLE inline void differentiate_moments(const Ar
     const Vector a = vectors(along + 3 * (size_t)first, own_count), b = vectors(about + 3 * (size_t)first, own_count);
     const Vector v = cross(b, m);
     const Number radius = numbers(packed + 3 * pitch + first);
-    Vector by_position = {0, 0, 0}, by_moment = by_position, field = by_position;
+    WrenchGradient sums;
     for (int j = share(); j < count; j += SHARES) {
-        const Mask others = !is_own(j);
         const Vector r = x - packed_vector(0, all_at, j), source = packed_vector(4, all_at, j);
         const Vector c = a - vector_of_all(along, j), source_v = cross(vector_of_all(about, j), source);
-        const DifferentiatedPair pair = differentiated_pair(r, radius, collect(packed + 3 * pitch, j));
-        add_where(others, field, second(pair, source));
-        add_where(others, by_moment, third(pair, c, source) + second(pair, source_v));
-        add_where(others, by_position, fourth(pair, c, m, source) + third(pair, v, source) + third(pair, m, source_v));
+        const DifferentiatedPair pair = differentiated_pair(r, radius, collect(packed + 3 * pitch, j), !is_own(j));
+        sums.add(pair, c, m, v, source, source_v);
     }
-    by_position = group_sums(by_position), by_moment = group_sums(by_moment), field = group_sums(field);
+    const Vector by_position = group_sums(sums.by_position + sums.along_m * m + sums.along_v * v);
+    const Vector by_moment = group_sums(sums.by_moment), field = group_sums(sums.field);
     const Vector h = INVERSE_4PI * field + vectors(applied + 3 * (size_t)first, own_count);
     const auto store = [&](Real* out, Vector value) { put_vectors(out + 3 * (size_t)first, lane_count, value); };
     store((Real*)arrays.by_positions.data, MU0 * INVERSE_4PI * by_position);

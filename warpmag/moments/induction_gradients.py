@@ -34,6 +34,7 @@ from warpmag.kernels.induction.tangent import Tangent, launch_parameter_gradient
 from warpmag.kernels.material.curves import CurveParameters
 from warpmag.kernels.pairs.packing import launch_divide_by_volume
 from warpmag.kernels.shared.axpy import launch_add_scaled
+from warpmag.moments.arrays import largest
 from warpmag.moments.gradients import sum_derivative, sum_field, wrench_product
 from warpmag.moments.pair_sums import BallMoments
 from warpmag.moments.tape import Gradients
@@ -62,11 +63,16 @@ class Equilibrium:
         """
         by_magnetization, by_field = cotangents
         tangent = Tangent(self.balls.radii, self.h, self.material)
-        own = self._field(by_field)
+        own = self._field(by_field) if largest(by_field) != 0.0 else wp.zeros_like(by_field)
         source = wp.zeros_like(own)
         launch_divide_by_volume(by_magnetization, self.balls.radii, source)
         launch_add_scaled(own, source)
-        w, coupled = self._solve(tangent, tangent.times(source))
+        right = tangent.times(source)
+        size = largest(right)
+        if not math.isfinite(size):
+            raise InputError("solve_induction: the gradient of the loss by its result is not finite")
+        w, coupled = self._solve(tangent, _scaled(right, 1.0 / size if size > 0.0 else 0.0))
+        w, coupled = _scaled(w, size), _scaled(coupled, size)
         launch_add_scaled(coupled, own)  # T η = T (∂L/∂H + S w)
         launch_add_scaled(coupled, source)  # ρ = V⁻¹ ∂L/∂M + T η
         eta = tangent.times(w)
@@ -80,13 +86,12 @@ class Equilibrium:
     def _solve(self, tangent: Tangent, right: wp.array) -> tuple[wp.array, wp.array]:
         """Return the solution w of (1 − S T S) w = ``right`` by conjugate gradients, and T S w.
 
-        The matrix is positive definite with eigenvalues below 3, so that the residual bounds the error.
+        The matrix is positive definite with eigenvalues below 3, so that the residual bounds the error. Components of
+        ``right`` are at most 1, so that squares do not underflow.
         """
         w, coupled, residual, direction = wp.zeros_like(right), wp.zeros_like(right), wp.clone(right), wp.clone(right)
         first = square = _inner(residual, residual)
         least = (self.rtol * self.rtol) * first
-        if not math.isfinite(square):
-            raise InputError("solve_induction: the gradient of the loss by its result is not finite")
         for _ in range(_MOST_ITERATIONS):
             if square <= least:
                 break
@@ -150,6 +155,13 @@ def wrench_product_of_balls(moments: BallMoments, count: int, external_field: wp
     if moments.count > count:
         balls |= {f"permanent: {name}": gradients[name][count:] for name in ("positions", "moments")}
     return balls
+
+
+def _scaled(values: wp.array, factor: float) -> wp.array:
+    """Return a factor times an array."""
+    product = wp.zeros_like(values)
+    launch_add_scaled(values, product, factor)
+    return product
 
 
 def _inner(a: wp.array, b: wp.array) -> float:
