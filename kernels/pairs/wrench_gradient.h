@@ -27,14 +27,14 @@ template <class N> CUDA_CALLABLE inline N averaged_fourth_factor(N d, N a, N b, 
 }
 
 // Pair of a target and a source: direction u, distance d, and the factors g1, g2 d², g2 d, g3 d³, g2, g3 d² and g4 d⁴.
-// All are zero at zero distance, so for a moment and itself, except that overlapping ``others`` have a g1.
+// All are zero unless they are ``others``, moments of different bodies.
 struct DifferentiatedPair {
     Vector u;
     Number g1, g2_d2, g2_d, g3_d3, g2, g3_d2, g4_d4;
 };
 CUDA_CALLABLE inline DifferentiatedPair differentiated_pair(Vector r, Number a, Number b, Mask others) {
     const Number d2 = dot(r, r), contact = a + b, zero = Number(Real(0));
-    Number i = d2 > zero ? Real(0.5) * twice_inverse_root(d2) : zero;
+    Number i = others & (d2 > zero) ? Real(0.5) * twice_inverse_root(d2) : zero;
     Number d = i * d2, i2 = i * i, i3 = i2 * i, fourth = 105 * i3 * i2;
     Vector u = i * r;
     Factors<Number> g = {-i3, 3 * i3 * i, -15 * i3 * i};
@@ -84,16 +84,8 @@ CUDA_CALLABLE inline Vector vector_of_all(const Real* vectors, int j) {
 // Writes the gradients of the moments from number ``first`` on: a vector of them, or one for a group of threads.
 template <class Arrays> CUDA_CALLABLE inline void differentiate_moments(const Arrays& arrays, int first) {
     const int count = arrays.packed.shape[1], left = count - first;
-#if defined(__CUDA_ARCH__)
-    const int lane_count = left > 0 && share() == 0, own = first;
+    const int own_count = left < WIDTH ? left : WIDTH, lane_count = share() == 0 ? own_count : 0;
     if (left <= 0) return;
-    const auto is_own = [&](int j) { return j == own; };
-#else
-    const int lane_count = left < WIDTH ? left : WIDTH;
-    Index own = first;
-    for (int l = 0; l < WIDTH; ++l) own[l] += l;
-    const auto is_own = [&](int j) { return mask_of(own == Index(j)); };
-#endif
     const size_t pitch = arrays.packed.strides[0] / sizeof(Real);
     const Real *packed = arrays.packed.data, *along = (const Real*)arrays.force_cotangents.data;
     const Real *about = (const Real*)arrays.torque_cotangents.data, *applied = (const Real*)arrays.external_field.data;
@@ -103,16 +95,16 @@ template <class Arrays> CUDA_CALLABLE inline void differentiate_moments(const Ar
     };
     const auto lanes_at = [](const Real* row) { return numbers(row); };
     const auto all_at = [](const Real* row) { return collect(row, 0); };
-    const int own_count = left < WIDTH ? left : WIDTH; // all threads of a group read the target
     const Vector x = packed_vector(0, lanes_at, first), m = packed_vector(4, lanes_at, first);
     const Vector a = vectors(along + 3 * (size_t)first, own_count), b = vectors(about + 3 * (size_t)first, own_count);
     const Vector v = cross(b, m);
-    const Number radius = numbers(packed + 3 * pitch + first);
+    const Number radius = numbers(packed + 3 * pitch + first), label = numbers(packed + 7 * pitch + first);
     WrenchGradient sums;
     for (int j = share(); j < count; j += SHARES) {
         const Vector r = x - packed_vector(0, all_at, j), source = packed_vector(4, all_at, j);
         const Vector c = a - vector_of_all(along, j), source_v = cross(vector_of_all(about, j), source);
-        const DifferentiatedPair pair = differentiated_pair(r, radius, collect(packed + 3 * pitch, j), !is_own(j));
+        const Mask others = label != collect(packed + 7 * pitch, j);
+        const DifferentiatedPair pair = differentiated_pair(r, radius, collect(packed + 3 * pitch, j), others);
         sums.add(pair, c, m, v, source, source_v);
     }
     const Vector by_position = group_sums(sums.by_position + sums.along_m * m + sums.along_v * v);

@@ -58,7 +58,7 @@ def launch_wrench_gradient(moments, external_field, force_cotangents, torque_cot
     """Return the gradients by positions, moments and external field, each of shape [n], from sums over all pairs.
 
     Args:
-        moments: Packed moments (``packing.PackedMoments``), each a body of its own.
+        moments: Packed moments (``packing.PackedMoments``). Moments of one body do not act on each other.
         external_field: Applied field H0 [A/m], shape [n].
         force_cotangents: ∂L/∂F [1/N], shape [n].
         torque_cotangents: ∂L/∂τ [1/(N·m)], shape [n].
