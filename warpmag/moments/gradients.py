@@ -71,7 +71,11 @@ def field_product(
 
 
 def wrench_product(
-    moments: BallMoments, external_field: wp.array, force_cotangents: wp.array, torque_cotangents: wp.array
+    moments: BallMoments,
+    external_field: wp.array,
+    force_cotangents: wp.array,
+    torque_cotangents: wp.array,
+    labels: wp.array | None = None,
 ) -> Gradients:
     """Return the gradients by ``positions``, ``moments`` and ``external_field`` of a function of forces and torques.
 
@@ -80,11 +84,13 @@ def wrench_product(
         external_field: Applied field H0 [A/m], shape [n].
         force_cotangents: Gradient of the function by the forces [1/N], shape [n].
         torque_cotangents: Gradient of the function by the torques [1/(N·m)], shape [n].
+        labels: Body of each moment, shape [n]; moments of one body do not act on each other. None means one body each.
     """
     radii = moments.radii
     if radii is None:
         radii = wp.zeros(moments.count, dtype=external_field.dtype._wp_scalar_type_, device=external_field.device)
-    packed = PackedMoments(radii, largest_radius=moments.largest_radius, moving=False)
+    labels_on_host = None if labels is None else labels.numpy()
+    packed = PackedMoments(radii, largest_radius=moments.largest_radius, labels=labels_on_host, moving=False)
     moments.pack(packed)
     gradients = launch_wrench_gradient(packed, external_field, force_cotangents, torque_cotangents)
     return dict(zip(("positions", "moments", "external_field"), gradients, strict=True))

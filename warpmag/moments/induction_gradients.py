@@ -62,22 +62,31 @@ class Equilibrium:
             needed: Names of arguments; permanent moments are ``permanent: positions`` and ``permanent: moments``.
         """
         by_magnetization, by_field = cotangents
+        by_moment = wp.zeros_like(by_field)
+        launch_divide_by_volume(by_magnetization, self.balls.radii, by_moment)
+        return self._product(by_moment, by_field, needed)
+
+    def product_of_moments(self, by_moment: wp.array, needed: set[str]) -> Gradients:
+        """Return the gradients by the arguments ``needed`` of a function of the moments m = V M, from ∂L/∂m."""
+        return self._product(by_moment, wp.zeros_like(by_moment), needed)
+
+    def _product(self, by_moment: wp.array, by_field: wp.array, needed: set[str]) -> Gradients:
+        """Return the gradients from V⁻¹ ∂L/∂M and ∂L/∂H."""
         tangent = Tangent(self.balls.radii, self.h, self.material)
         own = self._field(by_field) if largest(by_field) != 0.0 else wp.zeros_like(by_field)
-        source = wp.zeros_like(own)
-        launch_divide_by_volume(by_magnetization, self.balls.radii, source)
-        launch_add_scaled(own, source)
-        right = tangent.times(source)
+        rho = wp.clone(by_moment)
+        launch_add_scaled(own, rho)
+        right = tangent.times(rho)
         size = largest(right)
         if not math.isfinite(size):
-            raise InputError("solve_induction: the gradient of the loss by its result is not finite")
+            raise InputError("induction: the gradient of the loss by the magnetizations or the field is not finite")
         w, coupled = self._solve(tangent, _scaled(right, 1.0 / size if size > 0.0 else 0.0))
         w, coupled = _scaled(w, size), _scaled(coupled, size)
         launch_add_scaled(coupled, own)  # T η = T (∂L/∂H + S w)
-        launch_add_scaled(coupled, source)  # ρ = V⁻¹ ∂L/∂M + T η
+        launch_add_scaled(coupled, rho)  # ρ = V⁻¹ ∂L/∂M + T η
         eta = tangent.times(w)
         launch_add_scaled(by_field, eta)
-        return self._gradients(eta, own, source, tangent, needed)
+        return self._gradients(eta, own, rho, tangent, needed)
 
     def _field(self, vectors: wp.array) -> wp.array:
         """Return T v, the field at the balls of moments v at the balls."""

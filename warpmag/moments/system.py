@@ -305,6 +305,16 @@ class MomentSystem:
         return self._packed.radii
 
     @property
+    def largest_radius(self) -> float:
+        """Largest radius of the moments' balls [m]."""
+        return self._packed.largest_radius
+
+    @property
+    def bodies(self):
+        """Body of each moment on the device, shape [n]."""
+        return self._packed.labels
+
+    @property
     def count(self) -> int:
         """Number of moments n."""
         return self._packed.count

@@ -47,6 +47,13 @@ def check_constant(arguments: dict[str, Any], reason: str) -> None:
         raise InputError(f"{name}: requires a gradient, but {reason}")
 
 
+def check_untaped(arguments: dict[str, Any], reason: str) -> None:
+    """Raise ``InputError`` with a reason if a tape is active and any of the arguments requires a gradient."""
+    with paused_tape() as tape:
+        if tape is not None:
+            check_constant(arguments, reason)
+
+
 def record(
     tape: wp.Tape,
     arguments: dict[str, Any],

@@ -17,6 +17,7 @@ from warpmag.engine.magnets.eddy import gather_velocities, set_conductivities
 from warpmag.engine.magnets.grouping import BodyMagnet, find_magnets
 from warpmag.engine.magnets.magnet_system import KINEMATIC, make_system
 from warpmag.engine.magnets.model_values import ModelValues, magnetic_arrays
+from warpmag.engine.magnets.pose_gradients import record_forces
 from warpmag.engine.magnets.sources import ModelSources
 from warpmag.errors import InputError
 from warpmag.kernels.rigid.bodies import (
@@ -41,6 +42,7 @@ from warpmag.moments.arrays import (
 )
 from warpmag.moments.probe import FieldProbe
 from warpmag.moments.ranks import current_ranks
+from warpmag.moments.tape import check_untaped, paused_tape
 from warpmag.terminal import collection_paused
 
 
@@ -233,14 +235,19 @@ class Magnetics:
 
         Raises:
             InputError: ``model.warpmag`` has changed, see :meth:`notify_model_changed`; with a GPU some calls later.
+                Or a ``wp.Tape`` is active, ``body_q`` requires a gradient, and the forces have none.
         """
-        self.induce(state)
-        self.add_forces(state)
+        with paused_tape() as tape:
+            self.induce(state)
+            self.add_forces(state)
+            if tape is not None:
+                record_forces(tape, self.system, self._body_moments, self._model, state)
 
     def induce(self, state: newton.State) -> None:
         """Solve the induction at the poses of ``state``, starting from the last magnetizations."""
         values, system = self._values, self.system
         self._check_state(state, "body_q")
+        check_untaped({"state.body_q": state.body_q}, "only Magnetics.apply records one")
         self._induced = True
         gather_moments(
             *(state.body_q, self._body_moments, values.present, values.used, system.positions, system.moments),
