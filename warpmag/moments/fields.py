@@ -53,6 +53,8 @@ def h_field(
     over the target. The field excludes a moment's own field, and point dipoles at the target itself: at a distance
     of zero, or of less than about 1e-19 m in float32.
 
+    Warp arrays with ``requires_grad`` are differentiated on an active ``wp.Tape``: positions, moments and targets.
+
     Args:
         positions: Moment positions [m], shape [n, 3], NumPy or Warp.
         moments: Moments [A·m²], shape [n, 3].
@@ -73,7 +75,8 @@ def h_field(
 
     Raises:
         InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (see
-            ``warpmag.moments.arrays``), or the result is not finite.
+            ``warpmag.moments.arrays``), or the result is not finite. Or a tape is active, and an argument requires a
+            gradient that does not exist.
 
     Example:
         >>> import warpmag
@@ -141,6 +144,9 @@ def wrench(
     F = μ0 (m·∇)H (Kim and Han 2022, Eqs. 13 and 14) and τ = μ0 m × H. The mutual forces and torques conserve linear and
     angular momentum. Point dipoles at zero distance do not act on each other.
 
+    Warp arrays with ``requires_grad`` are differentiated on an active ``wp.Tape``: positions, moments and the external
+    field.
+
     Args:
         positions: Moment positions [m], shape [n, 3], NumPy or Warp.
         moments: Moments [A·m²], shape [n, 3].
@@ -158,7 +164,8 @@ def wrench(
 
     Raises:
         InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (see
-            ``warpmag.moments.arrays``), or a result is not finite.
+            ``warpmag.moments.arrays``), or a result is not finite. Or a tape is active, and an argument requires a
+            gradient that does not exist.
 
     Example:
         >>> import warpmag

@@ -165,6 +165,9 @@ def solve_induction(
     Balls may overlap. With the contact model ``dipole`` and sums over all pairs the solution is unique for any
     arrangement.
 
+    Warp arrays with ``requires_grad`` are differentiated on an active ``wp.Tape``: positions, radii, saturation,
+    susceptibility, external field and permanent moments with their positions.
+
     Args:
         positions: Ball centers [m], shape [n, 3], NumPy or Warp.
         radii: Ball radii [m], scalar or [n].
@@ -193,7 +196,8 @@ def solve_induction(
 
     Raises:
         InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (see
-            ``warpmag.moments.arrays``), or the result is not finite.
+            ``warpmag.moments.arrays``), or the result is not finite. Or a tape is active, and an argument requires a
+            gradient that does not exist.
 
     Warns:
         ConvergenceWarning: ``max_evaluations`` field evaluations did not reach ``rtol``; the best result is returned.

@@ -229,6 +229,8 @@ class Magnetics:
     def apply(self, state: newton.State) -> None:
         """Add the magnetic forces at the poses of ``state`` to ``state.body_f``; capturable in a graph.
 
+        On an active ``wp.Tape`` the forces are differentiated by poses, if ``state.body_q`` requires a gradient.
+
         Args:
             state: State with poses ``body_q``. Forces are added to ``body_f``, which is not cleared. Conducting magnets
                 also need velocities, ``body_qd``.
