@@ -27,8 +27,8 @@ MISSING = {name for name in ("torch", "isaaclab") if importlib.util.find_spec(na
 STAGE = re.compile(r"^```\n(#usda 1\.0\n# (\S+)\n.*?)^```$", re.MULTILINE | re.DOTALL)
 """A whole stage and the file to save it as."""
 COMMAND = re.compile(r"^(?:pip install uv && uv run )?(warpmag .*)$", re.MULTILINE)
-SLOW = ("physics.md", "howto/coils.md", "howto/holding.md", "howto/mujoco.md", "howto/newton.md")
-"""Pages whose kernels take long to compile, and no other test needs; ``.ci/run`` runs them, too."""
+SLOW = ("physics.md", *(f"howto/{name}.md" for name in ("coils", "gradients", "holding", "mujoco", "newton")))
+"""Pages that take long, most of them to compile kernels that no other test needs; ``.ci/run`` runs them, too."""
 
 
 def program(page: Path) -> str:

@@ -42,7 +42,7 @@ OWNERS = {
         "warpmag/isaaclab.py",
     ),
     "newton._src": ("warpmag/engine/pile_xpbd",),
-    "warp._src": ("warpmag/engine/pile_xpbd",),
+    "warp._src": ("warpmag/engine/pile_xpbd", "warpmag/moments/tape.py"),  # the active tape
     "pxr": ("warpmag/usd", "warpmag/show"),
     "warp": (
         *("warpmag/moments", "warpmag/engine", "warpmag/show", "warpmag/examples"),

@@ -5,6 +5,9 @@ model is finalized, and adds the magnetic forces in every substep, inside Isaac 
 hooks only: physics events, sites, and callbacks of ``NewtonManager``.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# pyright takes ``import torch`` and ``import jax`` here for the modules of these names in this folder
+
 # pyright: reportMissingImports=false
 import re
 from collections.abc import Callable

@@ -8,7 +8,6 @@ import warp as wp
 from warpmag.declarations.checks import check_not_negative, check_token, real_number
 from warpmag.declarations.magnets import check_rtol
 from warpmag.errors import InputError
-from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.moments.arrays import (
     LEAST_FORCE_MOMENT,
@@ -24,8 +23,10 @@ from warpmag.moments.arrays import (
     resolve_context,
 )
 from warpmag.moments.fmm import DEFAULT_RTOL, check_fast, is_fast
-from warpmag.moments.pair_sums import SumsShape, pair_sums
+from warpmag.moments.gradients import field_product, wrench_product
+from warpmag.moments.pair_sums import BallMoments, SumsShape, pair_sums
 from warpmag.moments.ranks import compare_arguments
+from warpmag.moments.tape import check_constant, paused_tape, record
 
 _METHODS = ("auto", "direct", "reference", "fmm")
 _LEAST_OF_FIELD = {wp.float32: 1e-25, wp.float64: 1e-200}
@@ -52,6 +53,8 @@ def h_field(
     over the target. The field excludes a moment's own field, and point dipoles at the target itself: at a distance
     of zero, or of less than about 1e-19 m in float32.
 
+    Warp arrays with ``requires_grad`` are differentiated on an active ``wp.Tape``: positions, moments and targets.
+
     Args:
         positions: Moment positions [m], shape [n, 3], NumPy or Warp.
         moments: Moments [A·m²], shape [n, 3].
@@ -72,7 +75,8 @@ def h_field(
 
     Raises:
         InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (see
-            ``warpmag.moments.arrays``), or the result is not finite.
+            ``warpmag.moments.arrays``), or the result is not finite. Or a tape is active, and an argument requires a
+            gradient that does not exist.
 
     Example:
         >>> import warpmag
@@ -80,29 +84,47 @@ def h_field(
         >>> round(float(field[0, 2]), 1)  # m / (2π r³)
         159.2
     """
-    context = resolve_context(positions, dtype, device)
-    smoothing, rtol = real_number("smoothing", smoothing), None if rtol is None else real_number("rtol", rtol)
-    reference = _is_reference(context, method, smoothing, radii, rtol, dtype)
-    same_set = targets is None
-    if same_set and target_radii is not None:
-        raise InputError("target_radii: only with targets; the moments' own radii are in radii")
-    size = _largest_radius("radii", radii, context.dtype, reference)
-    target_size = _largest_radius("target_radii", target_radii, context.dtype, reference)
-    farthest = largest_coordinate(context.dtype, size + (size if same_set else target_size), reference=reference)
-    x = context.vectors("positions", positions, farthest=farthest, shared=True)
-    m = context.vectors("moments", moments, x.shape[0], least=_LEAST_OF_FIELD, shared=True)
-    points = x if same_set else context.vectors("targets", targets, farthest=farthest, shared=True)
-    t = None if same_set else points.shape[0]
-    shape = SumsShape(
-        Quantity.FIELD, context.device.alias, context.dtype, x.shape[0], size, t, target_size, reference, smoothing
-    )
-    with pair_sums(shape) as sums:
-        _pack(context, "radii", radii, sums.moments, x, m)
+    with paused_tape() as tape:
+        context = resolve_context(positions, dtype, device)
+        smoothing, rtol = real_number("smoothing", smoothing), None if rtol is None else real_number("rtol", rtol)
+        reference = _is_reference(context, method, smoothing, radii, rtol, dtype)
+        same_set = targets is None
+        if same_set and target_radii is not None:
+            raise InputError("target_radii: only with targets; the moments' own radii are in radii")
+        size = _largest_radius("radii", radii, context.dtype, reference)
+        target_size = _largest_radius("target_radii", target_radii, context.dtype, reference)
+        farthest = largest_coordinate(context.dtype, size + (size if same_set else target_size), reference=reference)
+        x = context.vectors("positions", positions, farthest=farthest, shared=True)
+        m = context.vectors("moments", moments, x.shape[0], least=_LEAST_OF_FIELD, shared=True)
+        sources = _balls(context, "radii", radii, size, x, m)
+        points = sources
         if not same_set:
-            _pack(context, "target_radii", target_radii, sums.targets, points, wp.zeros_like(points))
-        sums.launch(_fmm_rtol(method, rtol, shape))
-        _check_finite("field", context, sums.out, x, m, points)
-        return context.result(sums.out, points.shape[0])
+            x = context.vectors("targets", targets, farthest=farthest, shared=True)
+            points = _balls(
+                context, "target_radii", target_radii, target_size, x, wp.zeros_like(x, requires_grad=False)
+            )
+        shape = SumsShape(
+            Quantity.FIELD, context.device.alias, context.dtype, sources.count, size,
+            None if same_set else points.count, target_size, reference, smoothing,
+        )  # fmt: skip
+        fmm_rtol = _fmm_rtol(method, rtol, shape)
+        with pair_sums(shape) as sums:
+            sources.pack(sums.moments)
+            if not same_set:
+                points.pack(sums.targets)
+            sums.launch(fmm_rtol)
+            _check_finite("field", context, sums.out, sources, points)
+            field = context.result(sums.out, points.count)
+        if tape is not None:
+            check_constant({"radii": radii, "target_radii": target_radii}, "the field has none by radii")
+            arguments = {"positions": positions, "moments": moments, "targets": targets}
+            _check_smoothing(smoothing, arguments)
+            others = None if same_set else points
+            record(
+                tape, arguments, [field],
+                lambda cotangents, needed: field_product(sources, others, cotangents[0], needed, fmm_rtol),
+            )  # fmt: skip
+        return field
 
 
 @compare_arguments
@@ -123,6 +145,9 @@ def wrench(
     F = μ0 (m·∇)H (Kim and Han 2022, Eqs. 13 and 14) and τ = μ0 m × H. The mutual forces and torques conserve linear and
     angular momentum. Point dipoles at zero distance do not act on each other.
 
+    Warp arrays with ``requires_grad`` are differentiated on an active ``wp.Tape``: positions, moments and the external
+    field.
+
     Args:
         positions: Moment positions [m], shape [n, 3], NumPy or Warp.
         moments: Moments [A·m²], shape [n, 3].
@@ -140,7 +165,8 @@ def wrench(
 
     Raises:
         InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (see
-            ``warpmag.moments.arrays``), or a result is not finite.
+            ``warpmag.moments.arrays``), or a result is not finite. Or a tape is active, and an argument requires a
+            gradient that does not exist.
 
     Example:
         >>> import warpmag
@@ -148,32 +174,49 @@ def wrench(
         >>> round(float(forces[0, 2]), 4)  # aligned moments attract each other: 3 μ0 m² / (2π r⁴)
         0.006
     """
-    context = resolve_context(positions, dtype, device)
-    smoothing, rtol = real_number("smoothing", smoothing), None if rtol is None else real_number("rtol", rtol)
-    reference = _is_reference(context, method, smoothing, radii, rtol, dtype)
-    size = _largest_radius("radii", radii, context.dtype, reference)
-    farthest = largest_coordinate(context.dtype, 2.0 * size, reference=reference)
-    x = context.vectors("positions", positions, farthest=farthest, shared=True)
-    n = x.shape[0]
-    check_bodies(f"positions: {n} moments that act on each other", n, context.dtype)
-    m = context.vectors("moments", moments, n, least=LEAST_FORCE_MOMENT, shared=True)
-    external = context.vectors("external_field", (0.0, 0.0, 0.0) if external_field is None else external_field, n)
-    options = {"reference": reference, "smoothing": smoothing}
-    shape = SumsShape(Quantity.WRENCH, context.device.alias, context.dtype, n, size, **options)
-    with pair_sums(shape) as sums:
-        _pack(context, "radii", radii, sums.moments, x, m)
-        wp.copy(sums.base, external)
-        sums.launch(_fmm_rtol(method, rtol, shape))
-        _check_finite("force", context, sums.out, x, m, x)
-        _check_finite("torque", context, sums.torques, x, m, x, more=", external_field")
-        return context.result(sums.out, n), context.result(sums.torques, n)
+    with paused_tape() as tape:
+        context = resolve_context(positions, dtype, device)
+        smoothing, rtol = real_number("smoothing", smoothing), None if rtol is None else real_number("rtol", rtol)
+        reference = _is_reference(context, method, smoothing, radii, rtol, dtype)
+        size = _largest_radius("radii", radii, context.dtype, reference)
+        farthest = largest_coordinate(context.dtype, 2.0 * size, reference=reference)
+        x = context.vectors("positions", positions, farthest=farthest, shared=True)
+        n = x.shape[0]
+        check_bodies(f"positions: {n} moments that act on each other", n, context.dtype)
+        m = context.vectors("moments", moments, n, least=LEAST_FORCE_MOMENT, shared=True)
+        external = context.vectors("external_field", (0.0, 0.0, 0.0) if external_field is None else external_field, n)
+        balls = _balls(context, "radii", radii, size, x, m)
+        options = {"reference": reference, "smoothing": smoothing}
+        shape = SumsShape(Quantity.WRENCH, context.device.alias, context.dtype, n, size, **options)
+        with pair_sums(shape) as sums:
+            balls.pack(sums.moments)
+            wp.copy(sums.base, external)
+            sums.launch(_fmm_rtol(method, rtol, shape))
+            _check_finite("force", context, sums.out, balls, balls)
+            _check_finite("torque", context, sums.torques, balls, balls, more=", external_field")
+            forces, torques = context.result(sums.out, n), context.result(sums.torques, n)
+        if tape is not None:
+            check_constant({"radii": radii}, "forces and torques have none by radii")
+            arguments = {"positions": positions, "moments": moments, "external_field": external_field}
+            _check_smoothing(smoothing, arguments)
+            record(
+                tape, arguments, [forces, torques],
+                lambda cotangents, needed: wrench_product(balls, external, *cotangents),
+            )  # fmt: skip
+        return forces, torques
 
 
-def _pack(context: CallContext, name, radii, packed: PackedMoments, positions, moments) -> None:
-    """Pack moments with the radii of argument ``name``; None leaves the packed radii at 0."""
-    if radii is not None:
-        wp.copy(packed.radii, context.scalars(name, radii, positions.shape[0]))
-    packed.pack(positions, moments)
+def _balls(context: CallContext, name, radii, size, positions, moments=None) -> BallMoments:
+    """Return moments, 0 by default, with the radii of argument ``name``, at most ``size`` [m]; None means points."""
+    radii = None if radii is None else context.scalars(name, radii, positions.shape[0])
+    moments = wp.zeros_like(positions, requires_grad=False) if moments is None else moments
+    return BallMoments(positions, moments, radii, size)
+
+
+def _check_smoothing(smoothing: float, arguments: dict) -> None:
+    """Raise ``InputError`` if an argument of a smoothed call requires a gradient."""
+    if smoothing > 0.0:
+        check_constant(arguments, "smoothing has none: the smoothed force is no gradient; leave smoothing out")
 
 
 def _fmm_rtol(method, rtol, shape: SumsShape) -> float | None:
@@ -212,7 +255,7 @@ def _is_reference(context: CallContext, method, smoothing, radii, rtol, dtype) -
     return method == "reference" or smoothing > 0.0
 
 
-def _check_finite(name, context: CallContext, results, positions, moments, targets, more=""):
+def _check_finite(name, context: CallContext, results, sources: BallMoments, targets: BallMoments, more=""):
     """Raise ``InputError`` if a result at a target is not finite.
 
     The message lists the arguments and ``more``, the distance of the nearest moment, and the largest moment.
@@ -220,7 +263,8 @@ def _check_finite(name, context: CallContext, results, positions, moments, targe
     row = first_not_finite(results, results.shape[0])
     if row is None:
         return
-    x, target, m = (array.numpy().astype(float) for array in (positions, targets, moments))
+    arrays = sources.positions, targets.positions, sources.moments
+    x, target, m = (array.numpy().astype(float) for array in arrays)
     distances = np.linalg.norm(x - target[row], axis=1)
     nearest = distances[distances > 0.0].min(initial=np.inf)
     raise InputError(

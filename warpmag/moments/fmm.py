@@ -129,7 +129,10 @@ class FastSums:
 
 
 class SystemSums(FastSums):
-    """Sums over pairs of a system's moments, by multipoles where that is faster."""
+    """Sums over pairs of a system's moments, by multipoles where that is faster.
+
+    ``rtol`` is the relative error of the fields.
+    """
 
     def __init__(self, moments, rtol: float, worlds: int, extent: float, crowding: float, always_from: float):
         """Allocate the boxes. Leaf boxes hold ``crowding`` times the optimal number of moments.
@@ -137,7 +140,7 @@ class SystemSums(FastSums):
         ``always_from`` is the smallest number of pairs that multipoles sum even if they are slower.
         """
         super().__init__(moments, rtol, worlds=worlds, extent=extent)
-        self._costs = moments.count, rtol, moments.device
+        self.rtol, self._costs = rtol, (moments.count, rtol, moments.device)
         self._crowding, self._always_from = crowding, always_from
 
     def uses_multipoles(self, quantity: Quantity, pairs: float) -> bool:
@@ -157,6 +160,8 @@ class SystemSums(FastSums):
 
 class NoFastSums:
     """Replacement of :class:`SystemSums` for systems that sum all pairs one by one."""
+
+    rtol = None
 
     def build(self):
         """Do nothing."""

@@ -27,9 +27,12 @@ from warpmag.moments.arrays import (
     real_array,
     resolve_context,
 )
+from warpmag.moments.induction_gradients import Equilibrium, wrench_product_of_balls
 from warpmag.moments.layout import MomentMaterial
+from warpmag.moments.pair_sums import BallMoments
 from warpmag.moments.ranks import compare_arguments
 from warpmag.moments.system import MomentSystem, SolverSettings
+from warpmag.moments.tape import check_constant, differentiable, paused_tape, record
 
 _FIELD_RANGE = {wp.float32: (3e-19, 1e12), wp.float64: (1e-100, 1e100)}
 """Smallest and largest field, in units of the saturation, by Warp scalar type: its square and root stay accurate."""
@@ -65,7 +68,7 @@ class InductionResult:
     _system: MomentSystem | None = field(repr=False)
     _context: CallContext = field(repr=False)
     _arguments: dict = field(repr=False)
-    _count: int = field(repr=False)
+    _balls: "_Balls" = field(repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the fields without those on the device, for pickle and copy."""
@@ -98,17 +101,52 @@ class InductionResult:
         """
         if self._system is None:
             raise InputError("wrench: a copied or unpickled result has no moments on a device, call wrench() before")
-        system, dtype = self._system, self._context.dtype
-        system.apply_forces(force)
-        strongest = largest(system.moments)
-        if 0.0 < strongest < LEAST_FORCE_MOMENT[dtype]:
-            raise InputError(
-                f"radii, saturation, external_field: moments of at most {strongest:.3g} A·m² are too small for forces "
-                f"{precision_hint(dtype)}"
-            )
-        forces, torques = (self._context.result(array, self._count) for array in (system.forces, system.torques))
-        _check_finite(dtype, self._count, self._arguments, force=forces, torque=torques)
+        system, dtype, count = self._system, self._context.dtype, self._balls.count
+        with paused_tape() as tape:
+            system.apply_forces(force)
+            strongest = largest(system.moments)
+            if 0.0 < strongest < LEAST_FORCE_MOMENT[dtype]:
+                raise InputError(
+                    f"radii, saturation, external_field: moments of at most {strongest:.3g} A·m² are too small for "
+                    f"forces {precision_hint(dtype)}"
+                )
+            forces, torques = (self._context.result(array, count) for array in (system.forces, system.torques))
+            _check_finite(dtype, count, self._arguments, force=forces, torque=torques)
+            if tape is not None and count:
+                self._record_wrench(tape, force, forces, torques)
         return forces, torques
+
+    def _record(self, tape: wp.Tape) -> None:
+        """Record the gradients of the solve on a tape."""
+        self._check_overlaps()
+        system, balls = self._system, self._balls
+        count, largest_radius = balls.count, float(balls.radii.max())
+        dipoles = BallMoments(balls.permanent_positions, balls.permanent_moments, None, 0.0)
+        moments = BallMoments(balls.positions, system.moments[:count], system.radii[:count], largest_radius)
+        h, rtol = system.h[:count], system.rtol
+        equilibrium = Equilibrium(moments, dipoles, h, system.material, rtol, system.fmm_rtol)
+        record(tape, self._arguments, [self.magnetizations, self.h_field], equilibrium.product)
+
+    def _record_wrench(self, tape: wp.Tape, force: str, forces, torques) -> None:
+        """Record the gradients of forces and torques on a tape."""
+        system, count = self._system, self._balls.count
+        arguments = {**self._arguments, "magnetizations": self.magnetizations}
+        del arguments["saturation"], arguments["susceptibility"]  # they act through the magnetizations
+        _check_differentiable(system.settings, arguments)
+        self._check_overlaps()
+        if force != "kelvin":
+            check_constant(arguments, f"the force {force!r} has none; use 'kelvin'")
+        moments = BallMoments(system.positions, system.moments, system.radii, float(self._balls.radii.max()))
+        record(
+            tape, arguments, [forces, torques],
+            lambda cotangents, _: wrench_product_of_balls(moments, count, system.external_field, cotangents),
+        )  # fmt: skip
+
+    def _check_overlaps(self) -> None:
+        """Raise ``InputError`` if radii of overlapping balls require gradients."""
+        radii = {"radii": self._arguments["radii"]}
+        if differentiable(radii) and self._system.overlaps:
+            check_constant(radii, "overlapping balls have none by radii; move them apart")
 
 
 @compare_arguments
@@ -135,6 +173,9 @@ def solve_induction(
 
     Balls may overlap. With the contact model ``dipole`` and sums over all pairs the solution is unique for any
     arrangement.
+
+    Warp arrays with ``requires_grad`` are differentiated on an active ``wp.Tape``: positions, radii, saturation,
+    susceptibility, external field and permanent moments with their positions.
 
     Args:
         positions: Ball centers [m], shape [n, 3], NumPy or Warp.
@@ -164,7 +205,8 @@ def solve_induction(
 
     Raises:
         InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (see
-            ``warpmag.moments.arrays``), or the result is not finite.
+            ``warpmag.moments.arrays``), or the result is not finite. Or a tape is active, and an argument requires a
+            gradient that does not exist.
 
     Warns:
         ConvergenceWarning: ``max_evaluations`` field evaluations did not reach ``rtol``; the best result is returned.
@@ -179,22 +221,26 @@ def solve_induction(
     if sources is not None:
         warnings.warn("solve_induction: sources is deprecated, use permanent", DeprecationWarning, stacklevel=3)
         permanent = sources if permanent is None else permanent
-    context = resolve_context(positions, dtype, device)
-    balls = _read_balls(context, positions, radii, external_field, permanent)
-    material = _read_material(balls.count, saturation, susceptibility, curve)
     settings = SolverSettings(
         dynamics=dynamics, contact_model=contact_model, method=method, rtol=rtol, max_evaluations=max_evaluations,
         single_torque=True,
     )  # fmt: skip
-    system = balls.make_system(context, material, settings, initial)
-    system.solve()
-    saturations = system.material.saturation.numpy()[: balls.count]
-    arguments = {"positions": positions, "radii": balls.radii, "saturation": saturations}
+    arguments = {"positions": positions, "radii": radii, "saturation": saturation, "susceptibility": susceptibility}
     arguments["external_field"] = external_field
-    if permanent is not None:
-        arguments["permanent: positions"], arguments["permanent: moments"] = permanent
-    arguments["initial"] = initial
-    return _read_result(context, system, balls.count, arguments)
+    with paused_tape() as tape:
+        context = resolve_context(positions, dtype, device)
+        balls = _read_balls(context, positions, radii, external_field, permanent)
+        if permanent is not None:
+            arguments["permanent: positions"], arguments["permanent: moments"] = permanent
+        if tape is not None:
+            _check_differentiable(settings, arguments)
+        material = _read_material(balls.count, saturation, susceptibility, curve)
+        system = balls.make_system(context, material, settings, initial)
+        system.solve()
+        result = _read_result(context, system, balls, arguments, initial)
+        if tape is not None and balls.count:
+            result._record(tape)
+    return result
 
 
 @dataclass(frozen=True)
@@ -281,16 +327,25 @@ def _read_material(count: int, saturation, susceptibility, curve) -> MomentMater
     )
 
 
-def _read_result(context: CallContext, system: MomentSystem, n: int, arguments: dict) -> InductionResult:
-    """Return the result of a solve of n balls, checked to be finite, and warn if it did not converge."""
-    dtype = context.dtype
+def _check_differentiable(settings: SolverSettings, arguments: dict) -> None:
+    """Raise ``InputError`` if an argument requires a gradient that a solve with these settings does not have."""
+    if settings.dynamics != "theta":
+        check_constant(arguments, f"the dynamics {settings.dynamics!r} has none; use 'theta'")
+    if settings.contact_model != "dipole":
+        check_constant(arguments, f"the contact model {settings.contact_model!r} has none; use 'dipole'")
+
+
+def _read_result(context: CallContext, system: MomentSystem, balls: _Balls, arguments, initial) -> InductionResult:
+    """Return the result of a solve, checked to be finite, and warn if it did not converge."""
+    dtype, n = context.dtype, balls.count
+    saturations = system.material.saturation.numpy()[:n]
     m, h = (context.result(array, n) for array in (system.magnetizations(), system.h))
-    _check_finite(dtype, n, arguments, magnetization=m, field=h)
+    _check_finite(dtype, n, {**arguments, "initial": initial}, magnetization=m, field=h)
     error = float(system.error.numpy().max(initial=0.0))
     if not math.isfinite(error):
         raise InputError(f"external_field, permanent, saturation: the error is not finite {precision_hint(dtype)}")
     strongest = float(np.abs(h if isinstance(h, np.ndarray) else h.numpy()).max(initial=0.0))
-    _check_strength(dtype, strongest, arguments["saturation"])
+    _check_strength(dtype, strongest, saturations)
     converged = bool(system.converged.numpy().all())
     if not converged:
         limit = system.settings.max_evaluations
@@ -301,7 +356,7 @@ def _read_result(context: CallContext, system: MomentSystem, n: int, arguments: 
         text = f"solve_induction: fields have an error of {field_error:.2g} > rtol {system.rtol:g}; use method direct"
         warnings.warn(text, ConvergenceWarning, stacklevel=4)
     evaluations = int(system.evaluations.numpy().max(initial=0))
-    return InductionResult(m, h, error, evaluations, converged, field_error, system, context, arguments, n)
+    return InductionResult(m, h, error, evaluations, converged, field_error, system, context, arguments, balls)
 
 
 def _check_strength(dtype, strongest: float, saturation):
@@ -328,5 +383,6 @@ def _check_finite(dtype, count: int, arguments: dict, **results):
         return
     least, most = _PLAUSIBLE[dtype]
     sizes = {name: np.abs(real_array(name, value)) for name, value in arguments.items() if value is not None}
+    sizes = {name: size[np.isfinite(size)] for name, size in sizes.items()}  # a susceptibility may be infinite
     unusual = [name for name, size in sizes.items() if ((size > 0.0) & ~((size > least) & (size < most))).any()]
     raise InputError(f"{', '.join(unusual or sizes)}: {failures[0]} is not finite {precision_hint(dtype)}")

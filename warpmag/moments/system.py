@@ -114,6 +114,7 @@ class MomentSystem:
         material: The material as kernels read it.
         dynamics: Magnetization dynamics of the inducible moments (``moments.dynamics``).
         is_fast: True if the fast multipole method sums the pairs.
+        fmm_rtol: Relative error of the fields by the fast multipole method; None without it.
         worlds: World of each moment, NumPy, shape [n].
         world_ranges: (First moment, first permanent moment, end) of each world.
         h: Field at the inducible moments [A/m], without a moment's own field, with the bias, shape [n]. The
@@ -163,7 +164,7 @@ class MomentSystem:
         self._make_sources(layout, sources, solids)
         rotatable = ~layout.aligned | settings.single_torque
         self._fast = fast_sums_for(settings.method, self._packed, layout, body_extent, float(settings.rtol))
-        self.is_fast = isinstance(self._fast, SystemSums)
+        self.is_fast, self.fmm_rtol = isinstance(self._fast, SystemSums), self._fast.rtol
         self._make_field(layout, near)
         self._make_cells(layout, couplings, {solid.first for solid in solids}, responses=theta)
         if self._cells is not None and solids:
@@ -328,9 +329,24 @@ class MomentSystem:
         return self._packed.radii
 
     @property
+    def largest_radius(self) -> float:
+        """Largest radius of the moments' balls [m]."""
+        return self._packed.largest_radius
+
+    @property
+    def bodies(self):
+        """Body of each moment on the device, shape [n]."""
+        return self._packed.labels
+
+    @property
     def count(self) -> int:
         """Number of moments n."""
         return self._packed.count
+
+    @property
+    def overlaps(self) -> bool:
+        """True if any balls overlapped in the last solve. Waits for the device."""
+        return bool(self._packed.overlap_counts.numpy().any())
 
     @property
     def rtol(self) -> float:

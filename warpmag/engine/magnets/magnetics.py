@@ -21,6 +21,7 @@ from warpmag.engine.magnets.grouping import BodyMagnet, find_magnets
 from warpmag.engine.magnets.imported_field import imported_field
 from warpmag.engine.magnets.magnet_system import KINEMATIC, make_system
 from warpmag.engine.magnets.model_values import ModelValues, magnetic_arrays
+from warpmag.engine.magnets.pose_gradients import record_forces
 from warpmag.engine.magnets.sources import ModelSources
 from warpmag.engine.magnets.world_reset import WorldMask, WorldRows
 from warpmag.errors import ConvergenceWarning, InputError
@@ -47,6 +48,7 @@ from warpmag.moments.arrays import (
 )
 from warpmag.moments.probe import FieldProbe
 from warpmag.moments.ranks import current_ranks
+from warpmag.moments.tape import check_untaped, paused_tape
 from warpmag.terminal import collection_paused
 
 
@@ -284,19 +286,25 @@ class Magnetics:
     def apply(self, state: newton.State) -> None:
         """Add the magnetic forces at the poses of ``state`` to ``state.body_f``; capturable in a graph.
 
+        On an active ``wp.Tape`` the forces are differentiated by poses, if ``state.body_q`` requires a gradient.
+
         Args:
             state: State with poses ``body_q``. Forces are added to ``body_f``, which is not cleared. Conducting magnets
                 also need velocities, ``body_qd``.
 
         Raises:
             InputError: ``model.warpmag`` has changed, see :meth:`notify_model_changed`; with a GPU some calls later.
+                Or a ``wp.Tape`` is active, ``body_q`` requires a gradient, and the forces have none.
 
         Warns:
             ConvergenceWarning: ``max_evaluations`` did not reach ``rtol``. With a GPU only methods that return arrays
                 to the host warn, because this one does not wait; see :attr:`converged`.
         """
-        self.induce(state)
-        self.add_forces(state)
+        with paused_tape() as tape:
+            self.induce(state)
+            self.add_forces(state)
+            if tape is not None:
+                record_forces(tape, self.system, self._body_moments, self._model, state)
         if self.device.is_cpu and not self.device.is_capturing:
             self._warn_unconverged(level=3)
 
@@ -304,6 +312,7 @@ class Magnetics:
         """Solve the induction at the poses of ``state``, starting from the last magnetizations."""
         values, system = self._values, self.system
         self._check_state(state, "body_q")
+        check_untaped({"state.body_q": state.body_q}, "only Magnetics.apply records one")
         self._induced = True
         gather_moments(
             *(state.body_q, self._body_moments, values.present, values.used, system.positions, system.moments),

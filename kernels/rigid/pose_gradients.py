@@ -1,0 +1,88 @@
+"""Gradients of body wrenches by body poses, from those of moments.
+
+With the cotangents g_F and g_τ of a body's force and torque, F_body = Σ F_i and τ_body = Σ τ_i + (x_i − c) × F_i, the
+cotangents of a moment's force and torque are g_F + g_τ × (x_i − c) and g_τ. The lever arm x_i − c has F_i × g_τ.
+Warp differentiates positions and permanent moments by the pose.
+"""
+
+import warp as wp
+
+from warpmag.kernels.rigid.bodies import BodyMoments
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def _spread_cotangents(
+    magnets: BodyMoments,
+    body_q_in: wp.array[wp.transform],
+    body_com_in: wp.array[wp.vec3],
+    body_flags_in: wp.array[wp.int32],
+    positions_in: wp.array[wp.vec3],
+    forces_in: wp.array[wp.vec3],
+    body_f_in: wp.array[wp.spatial_vector],
+    force_out: wp.array[wp.vec3],
+    torque_out: wp.array[wp.vec3],
+    arm_out: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    body = magnets.body[i]
+    if body < 0:
+        return
+    if (body_flags_in[body] & magnets.kinematic_flag) != 0:
+        return
+    center = wp.transform_point(body_q_in[body], body_com_in[body])
+    about = wp.spatial_bottom(body_f_in[body])
+    force_out[i] = wp.spatial_top(body_f_in[body]) + wp.cross(about, positions_in[i] - center)
+    torque_out[i] = about
+    arm_out[i] = wp.cross(forces_in[i], about)
+
+
+def spread_cotangents(magnets: BodyMoments, model, body_q, positions, forces, body_f) -> tuple[wp.array, ...]:
+    """Return the cotangents of forces, torques and lever arms of n moments, shape [n] each.
+
+    ``body_f`` are the cotangents of the bodies' wrenches, forces first. Kinematic bodies have none.
+    """
+    out = tuple(wp.zeros(len(positions), dtype=wp.vec3, device=positions.device) for _ in range(3))
+    inputs = [magnets, body_q, model.body_com, model.body_flags, positions, forces, body_f]
+    wp.launch(_spread_cotangents, len(positions), inputs=inputs, outputs=out, device=positions.device)
+    return out
+
+
+@wp.kernel(module="unique", enable_backward=True)
+def _multiply_poses(
+    magnets: BodyMoments,
+    body_q: wp.array[wp.transform],
+    body_com: wp.array[wp.vec3],
+    by_positions: wp.array[wp.vec3],
+    by_moments: wp.array[wp.vec3],
+    by_arms: wp.array[wp.vec3],
+    products_out: wp.array[float],
+):
+    i = wp.tid()
+    body = magnets.body[i]
+    frame = wp.transform_identity()
+    product = float(0.0)
+    if body >= 0:
+        frame = body_q[body]
+        x = wp.transform_point(frame, magnets.local_positions[i])
+        center = wp.transform_point(frame, body_com[body])
+        product = wp.dot(x, by_positions[i]) + wp.dot(x - center, by_arms[i])
+    if magnets.permanent[i]:
+        shape = magnets.shape[i]
+        moment = magnets.volumes[i] * magnets.magnetizations[shape]
+        moment = wp.transform_vector(frame, wp.transform_vector(magnets.shape_frames[shape], moment))
+        product = product + wp.dot(moment, by_moments[i])
+    products_out[i] = product
+
+
+def add_pose_gradients(magnets: BodyMoments, model, body_q, by_positions, by_moments, by_arms) -> None:
+    """Add to the gradients of ``body_q``, and of magnetizations where they have one.
+
+    The arguments are the gradients by positions, by permanent moments and by lever arms of n moments, shape [n] each.
+    """
+    device = body_q.device
+    products = wp.zeros(len(by_positions), dtype=float, device=device, requires_grad=True)
+    inputs = [magnets, body_q, model.body_com, by_positions, by_moments, by_arms]
+    with wp.Tape() as tape:
+        wp.launch(_multiply_poses, len(products), inputs=inputs, outputs=[products], device=device)
+    products.grad.fill_(1.0)
+    tape.backward()

@@ -1,0 +1,71 @@
+"""``warpmag.jax``: values are those of the calls on arrays, and gradients pass ``jax.test_util.check_grads``."""
+
+import numpy as np
+import pytest
+
+jax = pytest.importorskip("jax", reason="JAX is not installed")
+
+import jax.numpy as jnp  # noqa: E402
+from jax.test_util import check_grads  # noqa: E402
+
+import warpmag  # noqa: E402
+import warpmag.jax  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def double_precision():
+    before = jax.config.jax_enable_x64
+    jax.config.update("jax_enable_x64", True)  # for all threads, because JAX calls warpmag from another
+    yield
+    jax.config.update("jax_enable_x64", before)
+
+
+def arrays(*shapes, scale=1.0):
+    rng = np.random.default_rng(11)
+    return [jnp.asarray(scale * rng.normal(size=shape)) for shape in shapes]
+
+
+def check(function, arguments):
+    check_grads(function, arguments, order=1, modes=["rev"], eps=1e-5, rtol=1e-5, atol=1e-9)
+
+
+def test_field(device):
+    x, m, targets = arrays((4, 3), (4, 3), (3, 3))
+    field = jax.jit(lambda *a: warpmag.jax.h_field(*a, radii=0.1, device=device))(x, m, targets)
+    expected = warpmag.h_field(*map(np.asarray, (x, m, targets)), radii=0.1, dtype="float64", device=device)
+    assert field.dtype == jnp.float64 and np.allclose(field, expected, rtol=1e-12, atol=0.0)
+    check(lambda *a: warpmag.jax.h_field(*a, device=device), (x, m, targets))
+
+
+def test_wrench(device):
+    x, m, field = arrays((4, 3), (4, 3), (3,))
+
+    def scaled(x, m, field):  # newtons would be too small for the absolute tolerance
+        return [1e6 * part for part in warpmag.jax.wrench(x, m, external_field=field, device=device)]
+
+    check(scaled, (x, m, field))
+    batch = jax.vmap(lambda x: scaled(x, m, field)[0])(jnp.stack([x, 2.0 * x]))
+    assert np.allclose(batch[1], scaled(2.0 * x, m, field)[0], rtol=1e-12)
+
+
+def test_equilibrium(device):
+    noise, field, dipoles, dipole_moments = arrays((4, 3), (3,), (2, 3), (2, 3), scale=0.1)
+    lattice = np.stack(np.meshgrid([0, 1], [0, 1], [0]), -1).reshape(-1, 3)
+
+    def solve(noise, radii, saturation, susceptibility, field, dipoles, dipole_moments):
+        result = warpmag.jax.solve_induction(
+            lattice + noise, radii, saturation=saturation, susceptibility=susceptibility, rtol=1e-12,
+            external_field=20.0 * field, permanent=(dipoles + 2.0, dipole_moments), device=device,
+        )  # fmt: skip
+        return result.magnetizations, result.h_field, 1e6 * result.wrench()[0]
+
+    radii = jnp.array([0.3, 0.25, 0.3, 0.35])
+    check(solve, (noise, radii, jnp.float64(2.0), jnp.float64(30.0), field, dipoles, dipole_moments))
+
+
+def test_what_has_no_gradient_raises(device):
+    x, m = arrays((3, 3), (3, 3))
+    with pytest.raises(Exception, match="radii: requires a gradient"):
+        jax.grad(lambda radius: warpmag.jax.h_field(x, m, radii=radius, device=device).sum())(0.1)
+    with pytest.raises(warpmag.InputError, match="positions: must be float32 or float64"):
+        warpmag.jax.h_field(x.astype(jnp.float16), m)

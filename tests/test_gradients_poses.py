@@ -1,0 +1,106 @@
+"""Gradients of the forces on bodies by their poses, through ``Magnetics.apply`` on a tape."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from small_builders import R, add_ball, new_builder
+
+import warpmag
+
+FIELD = (2e4, 0.0, 5e4)
+MAGNETIZATION = (0.0, 3e5, 8e5)
+
+
+def model_of_balls(**settings):
+    """Two iron balls, a magnet that hangs off its body's center, and a pair of magnets on one body."""
+    builder = new_builder()
+    add_ball(builder, (0.0, 0.0, 0.0))
+    add_ball(builder, (0.001, 0.011, 0.0))
+    turn = wp.quat_from_axis_angle(wp.normalize(wp.vec3(1.0, 2.0, 0.5)), 0.7)
+    add_ball(builder, (0.012, 0.003, 0.001), magnetization=MAGNETIZATION, rotation=turn)
+    pair = builder.add_body(xform=wp.transform((-0.022, 0.004, 0.006), turn), mass=0.01, com=(0.002, 0.001, 0.0))
+    for offset in (0.0, 0.011):
+        builder.add_shape_sphere(pair, radius=R, xform=wp.transform((offset, 0.0, 0.0), wp.quat_identity()))
+    warpmag.add_permanent(builder, body=pair, magnetization=MAGNETIZATION)
+    model = builder.finalize(device="cpu", requires_grad=True)
+    return model, warpmag.Magnetics(model, external_field=FIELD, rtol=1e-5, **settings)
+
+
+def rotated(q, v):
+    """Warp's polynomial for the rotation of a vector, also for quaternions that are not of unit length."""
+    axis, w = q[:3], q[3]
+    return v * (2.0 * w * w - 1.0) + 2.0 * w * np.cross(axis, v) + 2.0 * axis * (axis @ v)
+
+
+def body_forces(poses, com):
+    """Wrenches of the bodies of :func:`model_of_balls` in float64, by calls on arrays."""
+    magnetization, volume = np.array(MAGNETIZATION), 4.0 / 3.0 * np.pi * R**3
+    body, local = np.array([0, 1, 2, 3, 3]), np.zeros((5, 3))
+    local[4, 0] = 0.011
+    x = np.array([poses[b, :3] + rotated(poses[b, 3:], v) for b, v in zip(body, local, strict=True)])
+    m = np.array([volume * rotated(poses[b, 3:], magnetization) for b in body[2:]])
+    material = warpmag.declarations.magnets.Magnet(kind="inducible")
+    balls = warpmag.solve_induction(
+        x[:2], R, saturation=material.saturation, susceptibility=material.susceptibility, external_field=FIELD,
+        permanent=(x[2:], m), rtol=1e-12, dtype="float64",
+    )  # fmt: skip
+    m = np.concatenate([volume * balls.magnetizations, m])
+    forces, torques = warpmag.wrench(x, m, radii=R, external_field=FIELD, dtype="float64")
+    # magnets of one body exert no forces on each other
+    own_forces, own_torques = warpmag.wrench(x[3:], m[3:], radii=R, dtype="float64")
+    forces[3:] -= own_forces
+    torques[3:] -= own_torques
+    torques[:2] = 0.0
+    total = np.zeros((4, 6))
+    for i, b in enumerate(body):
+        center = poses[b, :3] + rotated(poses[b, 3:], com[b])
+        total[b] += np.concatenate([forces[i], torques[i] + np.cross(x[i] - center, forces[i])])
+    return total
+
+
+def test_poses():
+    model, magnetics = model_of_balls()
+    state = model.state()
+    with wp.Tape() as tape:
+        magnetics.apply(state)
+    poses, com = state.body_q.numpy().astype(float), model.body_com.numpy().astype(float)
+    expected = body_forces(poses, com)
+    assert np.allclose(state.body_f.numpy(), expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
+    seed = np.random.default_rng(0).normal(size=expected.shape) * ([1.0] * 3 + [50.0] * 3)
+    state.body_f.grad.assign(seed)
+    tape.backward()
+    gradient = state.body_q.grad.numpy()
+    for name, part in (("positions", slice(0, 3)), ("rotations", slice(3, 7))):
+        step = np.zeros((4, 7))
+        step[:, part] = np.random.default_rng(1).normal(size=step[:, part].shape)
+        change = body_forces(poses + 1e-6 * step, com) - body_forces(poses - 1e-6 * step, com)
+        slope, typical = np.sum(seed * change) / 2e-6, np.linalg.norm(gradient[:, part])
+        assert abs(np.sum(gradient * step) - slope) < 1e-4 * typical, name  # float32, and rtol of the induction
+
+
+def test_what_has_no_gradient_raises():
+    model, magnetics = model_of_balls(force="zeeman")
+    with (
+        wp.Tape(),
+        pytest.raises(warpmag.InputError, match=r"state.body_q: .* the force 'zeeman' has none"),
+    ):
+        magnetics.apply(model.state())
+    with wp.Tape(), pytest.raises(warpmag.InputError, match=r"only Magnetics.apply records one"):
+        magnetics.induce(model.state())
+    builder = new_builder()
+    body = builder.add_body()
+    builder.add_shape_box(body, hx=0.01, hy=0.01, hz=0.01)
+    warpmag.add_inducible(builder, body=body)
+    model = builder.finalize(device="cpu", requires_grad=True)
+    with wp.Tape(), pytest.raises(warpmag.InputError, match="a body of cells has none"):
+        warpmag.Magnetics(model).apply(model.state())
+
+
+def test_a_tape_without_gradients_records_nothing():
+    builder = new_builder()
+    add_ball(builder, (0.0, 0.0, 0.0))
+    model = builder.finalize(device="cpu")
+    with wp.Tape() as tape:
+        warpmag.Magnetics(model, external_field=FIELD).apply(model.state())
+    assert isinstance(model, newton.Model) and not tape.launches

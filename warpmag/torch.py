@@ -1,0 +1,186 @@
+"""Calls on arrays for PyTorch: ``h_field``, ``wrench`` and ``solve_induction`` of tensors, with gradients.
+
+The functions are those of ``warpmag`` with tensors in place of arrays. Device and type are those of ``positions``,
+``float32`` or ``float64``; other tensors are converted. Kernels read and write the tensors' memory on the current
+stream. Each call records its gradient (``docs/howto/gradients.md``), which has no gradient of its own.
+
+Example:
+    >>> import torch
+    >>> import warpmag.torch
+    >>> positions = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.1]], requires_grad=True)
+    >>> moments = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
+    >>> forces, _ = warpmag.torch.wrench(positions, moments)
+    >>> forces[0, 2].backward()
+    >>> round(float(positions.grad[0, 2]), 2)  # the attraction of aligned moments grows by 4 F/r
+    0.24
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# pyright takes ``import torch`` and ``import jax`` here for the modules of these names in this folder
+
+import math
+from contextlib import nullcontext
+from dataclasses import dataclass
+
+import torch  # pyright: ignore[reportMissingImports]
+import warp as wp
+
+from warpmag.errors import InputError
+from warpmag.moments import fields, induction
+
+_DTYPES = {torch.float32: ("float32", wp.float32, wp.vec3), torch.float64: ("float64", wp.float64, wp.vec3d)}
+"""By type of tensors: type of a call, and Warp's types of scalars and vectors."""
+
+
+def h_field(positions, moments, targets=None, *, radii=None, target_radii=None, method="auto", rtol=None):
+    """Return the field H [A/m] of moments, shape [t, 3]; see :func:`warpmag.h_field`.
+
+    Gradients by ``positions``, ``moments`` and ``targets``.
+    """
+    tensors = {"positions": positions, "moments": moments, "targets": targets}
+    tensors |= {"radii": radii, "target_radii": target_radii}
+
+    def call(dtype, **arrays):
+        return [fields.h_field(method=method, rtol=rtol, dtype=dtype, **arrays)]
+
+    (field,) = _recorded(call, tensors, {"target_radii": "targets"})
+    return field
+
+
+def wrench(positions, moments, *, radii=None, external_field=None, method="auto", rtol=None):
+    """Return forces [N] and torques [N·m], shape [n, 3] each; see :func:`warpmag.wrench`.
+
+    Gradients by ``positions``, ``moments`` and ``external_field``.
+    """
+    tensors = {"positions": positions, "moments": moments, "radii": radii, "external_field": external_field}
+
+    def call(dtype, **arrays):
+        return fields.wrench(method=method, rtol=rtol, dtype=dtype, **arrays)
+
+    return _recorded(call, tensors, {})
+
+
+@dataclass(frozen=True)
+class InductionTensors:
+    """Magnetic equilibrium of n balls, returned by :func:`solve_induction`.
+
+    Attributes:
+        magnetizations: M [A/m], shape [n, 3].
+        h_field: Field H at the balls [A/m], without a ball's own, shape [n, 3].
+        error, evaluations, converged: As in :class:`warpmag.InductionResult`.
+    """
+
+    magnetizations: torch.Tensor
+    h_field: torch.Tensor
+    error: float
+    evaluations: int
+    converged: bool
+    _inputs: dict
+
+    def wrench(self):
+        """Return forces [N] and torques [N·m] on the balls by Kelvin's law, shape [n, 3] each."""
+        x, count = self._inputs["positions"], len(self.magnetizations)
+        radii = _filled(self._inputs["radii"], x, count, 1)
+        moments = (4.0 / 3.0 * math.pi) * radii[:, None] ** 3 * self.magnetizations
+        external_field = _filled(self._inputs["external_field"], x, count, 2)
+        dipoles = [torch.as_tensor(part, dtype=x.dtype, device=x.device) for part in self._inputs["permanent"]]
+        forces, torques = wrench(
+            torch.cat([x, dipoles[0]]),
+            torch.cat([moments, dipoles[1]]),
+            radii=torch.cat([radii.detach(), x.new_zeros(len(dipoles[0]))]),
+            external_field=torch.cat([external_field, torch.zeros_like(dipoles[0])]),
+        )
+        return forces[:count], torques[:count]
+
+
+def solve_induction(
+    positions, radii, *, saturation=None, susceptibility=math.inf, curve="tanh", external_field=None, permanent=None,
+    method="auto", rtol=1e-3, max_evaluations=1000, initial=None,
+) -> InductionTensors:  # fmt: skip
+    """Return the magnetic equilibrium of inducible balls; see :func:`warpmag.solve_induction`.
+
+    Gradients by all arguments that are numbers but ``initial``, ``rtol`` and ``max_evaluations``. They have a relative
+    error of about ``rtol``.
+    """
+    permanent = (positions.new_zeros(0, 3), positions.new_zeros(0, 3)) if permanent is None else permanent
+    tensors = {"positions": positions, "radii": radii, "saturation": saturation, "susceptibility": susceptibility}
+    tensors |= {"external_field": external_field, "dipoles": permanent[0], "dipole_moments": permanent[1]}
+    if saturation is None:  # of measured curves
+        del tensors["susceptibility"]
+    solved = []
+
+    def call(dtype, dipoles, dipole_moments, **arrays):
+        result = induction.solve_induction(
+            permanent=(dipoles, dipole_moments), curve=curve, method=method, rtol=rtol,
+            max_evaluations=max_evaluations, initial=initial, dtype=dtype, **arrays,
+        )  # fmt: skip
+        solved.append(result)
+        return [result.magnetizations, result.h_field]
+
+    m, h = _recorded(call, tensors, {"dipole_moments": "dipoles"})
+    inputs = {"positions": positions, "radii": radii, "external_field": external_field, "permanent": permanent}
+    return InductionTensors(m, h, solved[0].error, solved[0].evaluations, solved[0].converged, inputs)
+
+
+_SCALARS = ("radii", "target_radii", "saturation", "susceptibility")
+"""Arguments of one number for each ball; the others are vectors."""
+
+
+def _filled(value, like, count: int, ndim: int):
+    """Return a tensor of ``count`` numbers or vectors from fewer dimensions, of the type and device of ``like``."""
+    value = 0.0 if value is None else value
+    tensor = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+    return tensor if tensor.ndim >= ndim else tensor.expand(*((count, 3)[:ndim]))
+
+
+def _recorded(call, tensors: dict, owners: dict[str, str]):
+    """Return the results of a call on tensors by name, with gradients.
+
+    ``owners`` names the positions that an argument belongs to, if they are not ``positions``.
+    """
+    positions = tensors["positions"]
+    if not isinstance(positions, torch.Tensor) or positions.dtype not in _DTYPES:
+        raise InputError("positions: must be a tensor of float32 or float64")
+    given = {name: value for name, value in tensors.items() if value is not None}
+    for name in given:
+        count = len(given[owners.get(name, "positions")])
+        given[name] = _filled(given[name], positions, count, 1 if name in _SCALARS else 2)
+    return _Call.apply(call, tuple(given), *given.values())
+
+
+class _Call(torch.autograd.Function):
+    """A call on Warp arrays that records its gradient on a tape of its own."""
+
+    @staticmethod
+    def forward(ctx, call, names, *tensors):
+        """Return the results as tensors that share the memory of the call's results."""
+        dtype, scalar, vector = _DTYPES[tensors[0].dtype]
+        needed = ctx.needs_input_grad[2:]
+        with _stream(tensors[0]), wp.Tape() as ctx.tape:
+            ctx.arrays = [
+                wp.from_torch(tensor.detach().contiguous(), scalar if name in _SCALARS else vector, requires_grad=grad)
+                for name, tensor, grad in zip(names, tensors, needed, strict=True)
+            ]
+            ctx.results = call(dtype, **dict(zip(names, ctx.arrays, strict=True)))
+        return tuple(wp.to_torch(result, requires_grad=False) for result in ctx.results)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, *cotangents):
+        """Return the gradients of the tensors that require one."""
+        with _stream(cotangents[0]):
+            for array in ctx.arrays:
+                if array.requires_grad:
+                    array.grad.zero_()
+            for result, cotangent in zip(ctx.results, cotangents, strict=True):
+                wp.copy(result.grad, wp.from_torch(cotangent.contiguous(), result.dtype))
+            ctx.tape.backward()
+        gradients = [wp.to_torch(array.grad).clone() if array.requires_grad else None for array in ctx.arrays]
+        return None, None, *gradients
+
+
+def _stream(tensor: torch.Tensor):
+    """Return a context in which Warp launches on PyTorch's current stream of a tensor's device."""
+    if not tensor.is_cuda:
+        return nullcontext()
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)))
