@@ -82,14 +82,16 @@ def test_magnet_in_contact_pulls_right_wherever_the_cells_are(shift, device):
 
 def test_charges_of_a_face_are_neither_uniform_nor_linear():
     """Such charges belong to the cells. The response is symmetric, and the energy never positive."""
-    sides = np.array([0.004, 0.003, 0.002])
+    sides = 0.004, 0.003, 0.002
     for response, (a, b) in zip(face_response(sides, 4), ((1, 2), (0, 2), (0, 1)), strict=True):
         middles = (np.arange(4) + 0.5) / 4.0 - 0.5
         u, v = (x.ravel() for x in np.meshgrid(middles * sides[a], middles * sides[b], indexing="ij"))
         np.testing.assert_allclose(response, response.T, atol=1e-12)
         assert np.abs(response @ np.column_stack([np.ones(16), u, v])).max() < 1e-12
         assert np.linalg.eigvalsh(response).min() > -1e-12
-    assert np.abs(face_response(2.0 * sides, 4) - 2.0 * face_response(sides, 4)).max() < 1e-12  # a length
+    assert (
+        np.abs(face_response(tuple(2.0 * side for side in sides), 4) - 2.0 * face_response(sides, 4)).max() < 1e-12
+    )  # a length
 
 
 @pytest.mark.parametrize("solid", [lattice.box([0.02, 0.02, 0.0015]), lattice.cylinder(0.01, 0.004)])

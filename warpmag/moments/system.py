@@ -246,8 +246,7 @@ class MomentSystem:
             takes_part = [first not in closed_forms for first, _ in couplings]
             several = np.bincount(layout.worlds[[first for first, _ in couplings]], takes_part).max() > 1
             if several:
-                # common fields describe charges at the edges of a lone body: touching cubes would pull 9 % too much,
-                # and those of softened cells up to 30 %
+                # lone bodies are corrected: touching cubes would pull 9 % too much by common fields, 30 % if softened
                 couplings = [
                     (first, coupling.among_others if part and len(coupling.radii) > MOST_CELLS else coupling)
                     for (first, coupling), part in zip(couplings, takes_part, strict=True)
@@ -263,15 +262,12 @@ class MomentSystem:
 
     def _include_cells(self, couplings, closed_forms: set[int], susceptibility):
         """Let permanent bodies act on the cells near them by averages; ``closed_forms`` as in :meth:`_make_cells`."""
-        responses = {id(coupling): coupling for first, coupling in couplings if first not in closed_forms}
-        responses = {key: face_response(coupling.cell_sides, FACE_SPLIT) for key, coupling in responses.items()}
-        bodies = [
-            None
-            if first in closed_forms
-            else NearCellBody(first, coupling, responses[id(coupling)], float(susceptibility[first]))
-            for first, coupling in couplings
-        ]
-        if responses:
+        bodies: list[NearCellBody | None] = [None] * len(couplings)
+        for number, (first, coupling) in enumerate(couplings):
+            if first not in closed_forms:
+                response = face_response(tuple(coupling.cell_sides), FACE_SPLIT)
+                bodies[number] = NearCellBody(first, coupling, response, float(susceptibility[first]))
+        if any(bodies):
             self.source_interaction.include_cells(bodies, self.rotations, self.forces, self.torques)
 
     def _make_responses(self, layout: MomentLayout, couplings) -> BodyResponses | None:

@@ -10,6 +10,8 @@ is −½ μ0 φᵀ R φ. A body of finite susceptibility χ responds by χ/(χ +
 different faces do not act on each other: they fall off fast.
 """
 
+from functools import cache
+
 import numpy as np
 
 from warpmag.shapes.uniform_response import potentials
@@ -18,18 +20,19 @@ _GAUSS_POINTS = 3
 """Points along each side of a square, over which its potential is averaged."""
 
 
-def face_response(sides: np.ndarray, split: int) -> np.ndarray:
+@cache
+def face_response(sides: tuple[float, float, float], split: int) -> np.ndarray:
     """Return the responses R [m] of the faces of a cuboid across x, y and z, shape [3, split², split²].
 
-    ``sides`` are those of the cuboid [m], shape [3]. A face has ``split`` squares along each side; the last axis of the
+    ``sides`` are those of the cuboid [m]. A face has ``split`` squares along each side; the last axis of the
     cuboid comes last.
 
     Example:
-        >>> face_response(np.array([0.004, 0.004, 0.002]), 4).shape
+        >>> face_response((0.004, 0.004, 0.002), 4).shape
         (3, 16, 16)
     """
     others = (1, 2), (0, 2), (0, 1)
-    return np.stack([_rectangle_response(sides[list(axes)], split) for axes in others])
+    return np.stack([_rectangle_response(np.array([sides[k] for k in axes]), split) for axes in others])
 
 
 def _rectangle_response(sides: np.ndarray, split: int) -> np.ndarray:
