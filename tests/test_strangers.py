@@ -300,3 +300,44 @@ def test_a_signal_ends_native_code(name, tmp_path):
         _, errors = process.communicate(timeout=60)
     assert process.returncode == -signal.SIGKILL and errors == "warpmag: ended by a signal\n"
     assert time.monotonic() - began < 20.0  # one second, on a loaded machine
+
+
+@pytest.mark.parametrize(
+    ("first", "message"),
+    [
+        ('"PhysicsMaterialAPI", "PhysicsCollisionAPI"', "PhysicsMaterialAPI is applied before PhysicsCollisionAPI"),
+        ('"PhysicsCollisionAPI", "PhysicsMaterialAPI"', ""),
+    ],
+)
+def test_a_collider_that_physics_takes_for_a_material(first, message, tmp_path):
+    """USD's physics reads the first of its schemas alone if that is the material's: the collider would be missing."""
+    wall = f'def Cube "Wall" (apiSchemas = [{first}]) {{\ndouble size = 0.1\n}}\n'
+    balls_up.author(tmp_path / "scene.usda", columns=1, rows=1, layers=1)
+    path = tmp_path / "wall.usda"
+    path.write_text(f'#usda 1.0\n(\nsubLayers = [@./scene.usda@]\nmetersPerUnit = 1\nupAxis = "Z"\n)\n{wall}')
+    errors = [str(error) for error in check(path).errors]
+    assert [message in error for error in errors] == ([True] if message else [])
+    if not message:
+        assert "/Wall" in import_scene(path).builder.shape_label
+
+
+@pytest.mark.parametrize(("scale", "refused"), [("1e-6, 10, 1", True), ("1e-4, 10, 1", False)])
+def test_scales_that_usd_reads_wrongly(scale, refused, tmp_path):
+    """``Gf.Transform`` makes 1e-10 of scales below 1e-5: the mass would be 10,000 times too small."""
+    balls_up.author(tmp_path / "scene.usda", columns=1, rows=1, layers=1)
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usda"))
+    cube = stage.DefinePrim("/World/Foil", "Cube")
+    for api in (UsdPhysics.RigidBodyAPI, UsdPhysics.CollisionAPI):
+        api.Apply(cube)
+    UsdPhysics.MassAPI.Apply(cube).CreateDensityAttr(1000.0)
+    UsdGeom.Xformable(cube).AddScaleOp(precision=UsdGeom.XformOp.PrecisionDouble).Set(
+        tuple(map(float, scale.split(",")))
+    )
+    stage.GetRootLayer().Save()
+    path = str(tmp_path / "scene.usda")
+    if refused:
+        with pytest.raises(InputError, match="/World/Foil: transform has a scale of less than 1.1e-05"):
+            import_scene(path)
+    else:
+        scene = import_scene(path)
+        assert scene.builder.body_mass[scene.bodies["/World/Foil"]] == pytest.approx(1000.0 * 8.0 * 1e-3, rel=1e-5)

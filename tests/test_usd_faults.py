@@ -62,8 +62,8 @@ REFUSED = {
     "radius beyond single precision": (ball(radius="double radius = 1e300"), "/Ball: radius must be from"),
     "radius without a mass": (ball(radius="double radius = 1e-30"), "/Ball: radius must be from 1e-07 to 1e+06"),
     "scaled to nothing": (
-        posed(["xformOp:scale"], "float3 xformOp:scale = (1e-6, 1e-6, 1e-6)"),
-        "/Ball: radius 0.005 scaled by 1e-06 to 1e-06 must be",
+        posed(["xformOp:scale"], "float3 xformOp:scale = (1.2e-5, 1.2e-5, 1.2e-5)"),
+        "/Ball: radius 0.005 scaled by 1.2e-05 to 1.2e-05 must be",
     ),
     "negative mass": (ball("float physics:mass = -1"), "/Ball: physics:mass must not be negative"),
     "infinite density": (ball("float physics:density = inf"), "/Ball: physics:density must not be negative"),

@@ -39,7 +39,11 @@ _ROOT = Path(__file__).resolve().parents[2]
 _FRESH = {name: value for name, value in os.environ.items() if name != "PXR_WORK_THREAD_LIMIT"}
 _CAUSES = ("overlapped at the start", "apart at the start", "too fast for the shortest substep")
 """What may end a run of a sound stage, and has to be named then."""
+_SMALL = ("--size", "16x9", "--device")
 _READING = re.compile("USD's reader crashes on it|USD did not read it within")
+_NETWORK = ("socket.connect", "socket.getaddrinfo", "socket.gethostbyname", "socket.sendto", "urllib.Request")
+_DEVICES = re.compile(r"/dev/(?!null$)|/proc/self/mem|(pipe|link)\.png$")
+"""Events of Python that reach a network, and names that must not be opened."""
 _EXPECTED = re.compile(r"^warpmag: |^$|^\S+: (loading|compiling)|frame/s|s/frame|frame \[")
 
 
@@ -66,6 +70,32 @@ class Verdict:
     line: str = ""
     problems: list[str] = field(default_factory=list)
     seconds: float = 0.0
+
+
+class _Reached:
+    """What this process opens or connects to that it must not, as Python's audit hooks see it.
+
+    A hook stays for as long as the process: there is one of them, from the first use.
+    """
+
+    def __init__(self):
+        self.places, self._hooked = [], False
+
+    def begin(self) -> None:
+        """Forget what was reached."""
+        self.places.clear()
+        if not self._hooked:
+            self._hooked = True
+            sys.addaudithook(self._hear)
+
+    def _hear(self, event, arguments):
+        if event in _NETWORK:
+            self.places.append(f"{event} {arguments!r:.100}")
+        elif event == "open" and isinstance(arguments[0], str) and _DEVICES.search(arguments[0]):
+            self.places.append(f"open {arguments[0]}")
+
+
+_reached = _Reached()
 
 
 def make(number: int, seed: int, folder: Path, sources: list[Path]) -> tuple[Path, str, str]:
@@ -103,15 +133,22 @@ def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Ca
     path, verdict.form, verdict.done = make(number, seed, place, sources)
     (place / "done.txt").write_text(json.dumps([verdict.form, verdict.done]), encoding="utf-8")
     output = place / "out" / "out.usda"
+    _reached.begin()
     with _recorded() if command is in_process else contextlib.nullcontext([]) as simulations:
         verdict.check, told, stderr_of_check = command("check", str(path))
         verdict.run, _, stderr_of_run = command(
             "run", str(path), "--frames", "1", "--device", device, "-o", str(output)
         )
+    if verdict.run == OK and "texture" in verdict.done:  # which a picture alone reads
+        shown, _, stderr_of_render = command("render", str(path), "-o", str(place / "out.png"), *_SMALL, device)
+        verdict.problems += _talk("render", stderr_of_render)
+        if shown != OK and len(_messages(stderr_of_render)) != 1:
+            verdict.problems.append(f"render ends with {shown}: {_messages(stderr_of_render)}"[:300])
     errors = [line[12:] for line in told if line.startswith("error ")] + _messages(stderr_of_check)
     refusals = _messages(stderr_of_run)
     verdict.line = refusals[-1] if refusals else ""
     verdict.problems += [*_talk("check", stderr_of_check), *_talk("run", stderr_of_run)]
+    verdict.problems += [f"reached {place}" for place in _reached.places]
     verdict.problems += _disagreements(verdict.check, errors, verdict.run, refusals)
     if verdict.run == BAD_INPUT and output.exists():
         verdict.problems.append("a refused run wrote")

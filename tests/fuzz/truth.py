@@ -320,7 +320,7 @@ def _matrix(transform) -> np.ndarray:
 
 def _moments(reading, result):
     """Compare the moments of permanent magnets at the end with how they stand then, and who is a magnet at all."""
-    end = Usd.TimeCode(result.GetEndTimeCode())
+    end = Usd.TimeCode(_last_sample(result))
     caches = [UsdGeom.XformCache(time) for time in (Usd.TimeCode(result.GetStartTimeCode()), end)]
     if result.GetEndTimeCode() == result.GetStartTimeCode():  # frames shorter than a step: no moments yet
         return
@@ -356,6 +356,12 @@ def _moments(reading, result):
         apart = at_rest and np.linalg.norm(given @ after - written) > 0.2 * size
         if apart or not math.isclose(size, np.linalg.norm(written), rel_tol=1e-3):
             yield f"moment of {prim.GetPath()}: {written} for {given @ after}"
+
+
+def _last_sample(result) -> float:
+    """The time code of the last step, which may be a little later than the last whole frame."""
+    attributes = (prim.GetAttribute("warpmag:moment") for prim in result.Traverse())
+    return max([result.GetEndTimeCode(), *(time for one in attributes if one for time in one.GetTimeSamples()[-1:])])
 
 
 def _shares(reading, prim) -> bool:

@@ -58,6 +58,8 @@ def winding_number(points: np.ndarray, triangles: np.ndarray) -> Callable[..., n
     def winding(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         x, y = np.broadcast_arrays(x, y)
         shape = np.broadcast_shapes(x.shape, z.shape)
+        if not math.prod(shape):
+            return np.zeros(shape, np.int16)
         height, sign, count = crossings(np.stack([x.reshape(-1), y.reshape(-1)], axis=1))
         result, start = (
             np.zeros((len(count), math.prod(shape) // max(1, len(count))), np.int16),

@@ -10,12 +10,20 @@ from warpmag.usd.schemas import MATERIAL
 from warpmag.usd.values import Finding
 
 _PURPOSE = "physics"
+_ROLES = {"PhysicsMaterialAPI", "PhysicsRigidBodyAPI", "PhysicsCollisionAPI"}
+"""Schemas of which USD's physics reads the first one alone, if that is the material's."""
 
 
 def material_findings(colliders: list[Usd.Prim]) -> Iterator[Finding]:
-    """Yield an error for each collider whose physics material is inactive, abstract or not defined."""
+    """Yield an error for each collider that is a physics material, or has an inactive, abstract or undefined one."""
     if not colliders:
         return
+    for collider in colliders:
+        if next(name for name in collider.GetAppliedSchemas() if name in _ROLES) == "PhysicsMaterialAPI":
+            yield Finding(
+                str(collider.GetPath()),
+                "PhysicsMaterialAPI is applied before PhysicsCollisionAPI: USD's physics reads a material, no collider",
+            )
     materials, _ = UsdShade.MaterialBindingAPI.ComputeBoundMaterials(colliders, _PURPOSE)
     for collider, bound in zip(colliders, materials, strict=True):
         prim = bound.GetPrim()

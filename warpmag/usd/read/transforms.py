@@ -13,6 +13,8 @@ _RESET = "!resetXformStack!"
 _INVERSE = "!invert!"
 SCALE_TOLERANCE = 1e-5
 """Relative tolerance for equal scales and right angles of axes: poses are often in single precision."""
+LEAST_SCALE = 1.1e-5
+"""Least scale of a body: ``Gf.Transform``, by which USD's physics reads scales, makes 1e-10 of scales below 1e-5."""
 
 
 def is_animated(prim: Usd.Prim) -> bool:
@@ -50,8 +52,8 @@ def rigid_fault(world: np.ndarray, *, may_mirror: bool = False) -> tuple[str, st
     matrix, farthest = world[:3, :3], np.abs(world).max()
     if not farthest <= LARGEST_COORDINATE:
         return f"reaches {farthest:g}, beyond {LARGEST_COORDINATE:g}", ""
-    if np.linalg.norm(matrix, axis=1).min() < 1.0 / LARGEST_COORDINATE:
-        return f"has a scale of less than {1.0 / LARGEST_COORDINATE:g}", ""
+    if np.linalg.norm(matrix, axis=1).min() < LEAST_SCALE:
+        return f"has a scale of less than {LEAST_SCALE:g}", ", which USD's physics reads wrongly: apply it to the sizes"
     gram = matrix @ matrix.T  # rotation and scale leave the axes at right angles
     if np.abs(gram - np.diag(np.diag(gram))).max() > SCALE_TOLERANCE * np.trace(gram) / 3.0:
         return "is sheared", ", which Newton imports wrongly"

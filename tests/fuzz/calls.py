@@ -1,0 +1,299 @@
+"""``python -m tests.fuzz.calls``: wild calls of every public function that takes builders, models, states or arrays.
+
+    python -m tests.fuzz.calls --count 2000 --seed 7           so many calls of each function
+    python -m tests.fuzz.calls --count 100 --only apply        of functions with ``apply`` in their names
+
+Each call has one to three wild arguments among right ones: numbers, texts, arrays of other sizes, types and memory,
+states and models of other worlds. It must end in an ``InputError`` of one line or in finite results. The calls run in
+child processes, so that a crash counts; it ends the child, and the next one goes on behind the call that did it.
+"""
+
+import argparse
+import inspect
+import json
+import math
+import os
+import random
+import resource
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+import warpmag
+from warpmag.moments.probe import FieldProbe
+
+SECONDS, MEMORY = 60, 8 << 30
+"""CPU time of a call [s], with kernels compiled, and address space of a child [bytes]."""
+M = (0.0, 0.0, 1e6)
+POINTS = np.array([(0.0, 0.0, 0.05), (0.02, 0.0, 0.0)])
+
+
+def new_world(balls: int = 2) -> dict[str, Any]:
+    """Return right arguments by name: a model of balls, iron, a coil and a site, with all that takes its states."""
+    builder = newton.ModelBuilder()
+    warpmag.register_attributes(builder)
+    for number in range(balls):
+        body = builder.add_body(xform=wp.transform((0.0, 0.0, 0.015 * number), wp.quat_identity()))
+        builder.add_shape_sphere(body, radius=0.005)
+        builder.add_shape_sphere(body, xform=wp.transform((0.0, 0.02, 0.0), wp.quat_identity()), radius=0.001)
+        if number % 2:
+            warpmag.add_inducible(builder, body=body)
+        else:
+            warpmag.add_permanent(builder, body=body, magnetization=M)
+    coil = warpmag.add_coil(builder, body=0, radius=0.01, ampere_turns=1.0, label="coil")
+    builder.add_site(0, label="site")
+    model = builder.finalize(device="cpu")
+    magnetics, state = warpmag.Magnetics(model), model.state()
+    magnetics.apply(state)
+    viewer = newton.viewer.ViewerNull()
+    return {
+        **{"builder": builder, "scene": builder, "model": model, "state": state, "magnetics": magnetics},
+        **{"viewer": viewer, "control": model.control(), "positions": POINTS, "points": POINTS, "body": 0},
+        **{"sites": "site", "coil": coil, "ampere_turns": 2.0, "external_field": (0.0, 0.0, 1e4), "count": 2},
+        **{"magnetization": M, "magnetizations": {1: M}, "material": "iron", "time": 0.0, "frames": 1, "radius": 0.005},
+        **{"origin": (0.0, 0.0, 0.0), "spacing": 0.01, "values": np.ones((3, 3, 3, 3)), "name": "iron"},
+        **{"fields": [0.0, 1e3, 1e5], "flux_densities": [0.0, 1.0, 1.5], "path": os.devnull, "output": None},
+        **{"moments": np.ones((2, 3)), "radii": 0.005, "saturation": 1e6, "system": magnetics.system},
+    } | {"sensor": warpmag.SensorMagnetometer(model, magnetics, "site"), "probe": FieldProbe(magnetics.system, 2)}
+
+
+# functions of a world, by what has to be made before the call; the arguments are those of the signature
+OWNERS: dict[str, Callable[[dict], Any]] = {
+    "Magnetics": lambda world: world["magnetics"],
+    "SensorMagnetometer": lambda world: world["sensor"],
+    "FieldProbe": lambda world: world["probe"],
+    "Display": lambda world: warpmag.Display(world["viewer"], world["model"], world["magnetics"]),
+    "Simulation": lambda world: warpmag.Simulation(new_builder(world), device="cpu"),
+}
+CLASSES = {"FieldProbe": FieldProbe, **{name: getattr(warpmag, name) for name in OWNERS if name != "FieldProbe"}}
+FUNCTIONS = (
+    *("register_attributes", "register_custom_attributes", "add_inducible", "add_permanent", "add_balls", "add_coil"),
+    *("add_field_map", "material", "KeyedCurrents", "solve_induction", "h_field", "wrench"),
+)
+CURVES = ("from_bh", "from_mh", "from_csv")
+PASSIVE = {"persistent_arrays", "warnings", "frame", "allow_restart"}
+"""Methods without arguments that return no numbers."""
+
+
+def new_builder(world: dict) -> newton.ModelBuilder:
+    """Return a builder of a ball as a magnet, which a simulation may change."""
+    builder = newton.ModelBuilder()
+    warpmag.register_attributes(builder)
+    builder.add_shape_sphere(builder.add_body(), radius=0.005)
+    warpmag.add_permanent(builder, body=0, magnetization=M)
+    return builder
+
+
+def targets() -> dict[str, Callable[[dict], Callable]]:
+    """Return every function by name, from a world: functions, constructors, methods and settable properties."""
+    found: dict[str, Callable[[dict], Callable]] = {}
+    for name in FUNCTIONS:
+        found[name] = lambda world, name=name: getattr(warpmag, name)
+    for name in CURVES:
+        found[f"MagnetizationCurve.{name}"] = lambda world, name=name: getattr(warpmag.MagnetizationCurve, name)
+    for owner, make in OWNERS.items():
+        found[owner] = lambda world, owner=owner: CLASSES[owner]
+        for name, member in vars(CLASSES[owner]).items():
+            if name.startswith("_") or name in PASSIVE:
+                continue
+            if inspect.isfunction(member):
+                found[f"{owner}.{name}"] = lambda world, make=make, name=name: getattr(make(world), name)
+            elif isinstance(member, property) and member.fset:
+                found[f"{owner}.{name}"] = lambda world, make=make, name=name: _setter(make(world), name)
+    return found
+
+
+def _setter(owner: Any, name: str) -> Callable:
+    def assign(control):
+        setattr(owner, name, control)
+
+    return assign
+
+
+def wild(chance: random.Random, world: dict) -> Any:
+    """Return a value that few functions expect."""
+    number = chance.choice((0, -1, 1, 2, 3, 7, 2**31, 10**40, -(2**63), 0.5, 1e-30, 1e30, 1e300, math.nan, math.inf))
+    kind = chance.randrange(12)
+    if kind < 2:
+        return chance.choice((number, np.float32(min(number, 1e38)), np.int64(3), True, 1j, wp.float64(0.5)))
+    if kind == 2:
+        return chance.choice(("", "x", "*", "site", "cuda:9", "a" * 5000, "[", b"x", Path("/nowhere"), "\0", "tanh"))
+    if kind == 3:
+        return chance.choice((None, object(), [], {}, (), set(), lambda *_: None, int, [[1.0], [2.0, 3.0]], [None]))
+    if kind < 6:
+        shape = chance.choice(((), (0,), (1,), (3,), (2, 3), (5, 3), (0, 3), (3, 1), (2, 7), (1, 2, 3), (1000, 3)))
+        array = np.full(shape, chance.choice((0.0, 1.0, 1e-9, float(max(min(number, 1e300), -1e300)))))
+        return chance.choice((array, array.astype(np.float32), array.astype("U5"), array[::-1] if shape else array))
+    if kind < 9:
+        dtype = chance.choice((float, wp.float64, int, wp.vec3, wp.vec3d, wp.quat, wp.transform, wp.spatial_vector))
+        size = chance.choice((0, 1, 2, 3, 7, 1000, (2, 2), (3, 1)))
+        array = wp.zeros(size, dtype=dtype, device="cpu")
+        return array[::2] if array.ndim == 1 and array.size > 1 and chance.random() < 0.3 else array
+    other = world if kind == 9 else _others(chance)
+    return other[chance.choice(sorted(other))]
+
+
+def _others(chance: random.Random, cache: dict = {}) -> dict:  # noqa: B006 - worlds of other sizes, made once
+    balls = chance.choice((1, 3, 7))
+    if balls not in cache:
+        cache[balls] = new_world(balls)
+    return cache[balls]
+
+
+@dataclass
+class Outcome:
+    """What became of one call: its number, ``taken`` if it was not refused, and a problem if there is one."""
+
+    number: int
+    call: str = ""
+    taken: bool = False
+    problem: str = ""
+
+
+@dataclass
+class Caller:
+    """Makes calls of one function."""
+
+    name: str
+    seed: int
+    world: dict = field(default_factory=new_world)
+
+    def call(self, number: int, announce: Callable[[str], Any] = lambda _: None) -> Outcome:
+        """Make one call, and a right one after it; return what became of it."""
+        chance = random.Random(f"{self.seed}-{self.name}-{number}")
+        function = targets()[self.name](self.world)
+        names = [one for one in inspect.signature(function).parameters if one not in ("args", "options", "overlays")]
+        parameters = inspect.signature(function).parameters
+        arguments = {one: self.world[one] for one in names if parameters[one].default is inspect.Parameter.empty}
+        for one in chance.sample(names, min(len(names), chance.randint(1, 3))):
+            arguments[one] = wild(chance, self.world)
+        outcome = Outcome(number, f"{self.name}({', '.join(f'{k}={_short(v)}' for k, v in arguments.items())})")
+        announce(outcome.call)
+        try:
+            result = function(**arguments)
+            outcome.taken = True
+            if not all(np.isfinite(array).all() for array in _numbers(result)):
+                outcome.problem = f"not finite: {_short(result)}"
+        except warpmag.InputError as error:
+            if "\n" in str(error) or not 0 < len(str(error)) < 1000:
+                outcome.problem = f"a message of {len(str(error))}: {error}"[:300]
+        except warpmag.SimulationError:
+            pass
+        except BaseException as error:
+            if isinstance(error, MemoryError) or not _raised_by(error, arguments):
+                outcome.problem = f"{type(error).__name__}: {error}"[:200] + traceback.format_exc()[-500:]
+        if outcome.taken:
+            self._go_on(outcome)
+        return outcome
+
+    def _go_on(self, outcome: Outcome) -> None:
+        """Use what the call was about, then replace it."""
+        try:
+            magnetics, state = self.world["magnetics"], self.world["model"].state()
+            magnetics.apply(state)
+            if not (np.isfinite(state.body_f.numpy()).all() and np.isfinite(magnetics.b_field(POINTS)).all()):
+                outcome.problem = outcome.problem or "forces and fields are not finite after it"
+        except warpmag.InputError:
+            pass
+        except BaseException as error:
+            outcome.problem = outcome.problem or f"later {type(error).__name__}: {error}"[:300]
+        self.world = new_world()
+
+
+def _raised_by(error: BaseException, arguments: dict) -> bool:
+    """Return True for the error of a function that was an argument."""
+    code = [one.__code__ for one in arguments.values() if inspect.isfunction(one)]
+    return any(frame.f_code in code for frame, _ in traceback.walk_tb(error.__traceback__))
+
+
+def _numbers(result: Any) -> Iterator[np.ndarray]:
+    for one in result if isinstance(result, tuple | list) else [result]:
+        if isinstance(one, wp.array) and one.dtype in (wp.float32, wp.vec3):
+            yield one.numpy()
+        elif isinstance(one, np.ndarray | float):
+            yield np.asarray(one)
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, np.ndarray | wp.array):
+        return f"{type(value).__module__.split('.')[0]}.{getattr(value.dtype, '__name__', value.dtype)}{value.shape}"
+    return " ".join(repr(value).split())[:80]
+
+
+def _child(name: str, seed: int, numbers: list[int], outward: int) -> None:
+    """Make calls, and write a line before and after each; never return."""
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    warnings.simplefilter("ignore")
+    silent = os.open(os.devnull, os.O_WRONLY)
+    for descriptor in (1, 2):
+        os.dup2(silent, descriptor)
+    caller = Caller(name, seed)
+
+    def say(kind: str, *parts: Any) -> None:
+        os.write(outward, json.dumps([kind, *parts]).encode() + b"\n")
+
+    for number in numbers:
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        limit = int(used.ru_utime + used.ru_stime) + SECONDS
+        resource.setrlimit(resource.RLIMIT_CPU, (limit, resource.RLIM_INFINITY))
+        outcome = caller.call(number, lambda text, number=number: say("begin", number, text))
+        say("end", number, outcome.call, outcome.taken, outcome.problem)
+    os._exit(0)
+
+
+def outcomes(name: str, seed: int, numbers: list[int]) -> Iterator[Outcome]:
+    """Yield what became of calls of one function; the problem of a call that ended its process is how it did."""
+    left = list(numbers)
+    while left:
+        inward, outward = os.pipe()
+        process = os.fork()
+        if not process:
+            os.close(inward)
+            try:
+                _child(name, seed, left, outward)
+            finally:
+                os._exit(1)
+        os.close(outward)
+        last = ""
+        with os.fdopen(inward, encoding="utf-8") as lines:
+            for kind, number, call, *rest in map(json.loads, lines):
+                last = call
+                if kind == "end":
+                    left.remove(number)
+                    yield Outcome(number, call, *rest)
+        _, status = os.waitpid(process, 0)
+        if left:
+            yield Outcome(left.pop(0), last, problem=f"its process ended with the status {status}")
+
+
+def main() -> int:
+    """Make calls of all functions, and print a line about each function and each problem."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=200, help="calls of each function (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="which calls (default: %(default)s)")
+    parser.add_argument("--only", default="", help="part of the names of the functions")
+    options = parser.parse_args()
+    new_world()  # kernels are compiled before the first fork
+    total = 0
+    for name in (one for one in targets() if options.only in one):
+        results = list(outcomes(name, options.seed, list(range(options.count))))
+        bad = [one for one in results if one.problem]
+        total += len(bad)
+        print(f"{name:40} {sum(one.taken for one in results):6} taken {len(bad):6} problems", flush=True)
+        for one in bad[:5]:
+            print(f"    {one.number}: {one.call[:300]}\n        {one.problem}", flush=True)
+    print(f"{total} problems")
+    return 1 if total else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
