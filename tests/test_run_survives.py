@@ -434,3 +434,50 @@ def test_a_damaged_cache_is_refused_or_readable(place, scene, tmp_path, device, 
     else:
         assert len(frames_of(output)) == 5
         assert not trial_read(cache)
+
+
+FOREIGN = {
+    "of another length": lambda saved, other: other,
+    "of no numbers": lambda saved, other: saved | {"file/times": np.array("x")},
+    "of other places": lambda saved, other: saved | {"file/heads": saved["file/heads"] + 8},
+    "of fewer values": lambda saved, other: saved | {"file/types": saved["file/types"][:1]},
+    "of other statistics": lambda saved, other: saved | {"state/stat.error": np.zeros(0)},
+    "of another time": lambda saved, other: saved | {"state/steps": np.array(5)},
+    "of endless buffers": lambda saved, other: saved | {"state/buffers": 0 * saved["state/buffers"] + 2**60},
+}
+
+
+@pytest.mark.parametrize("kind", FOREIGN)
+def test_a_foreign_checkpoint_is_refused_and_nothing_written(kind, scene, tmp_path, device, always, capsys):
+    for name, frames, last in (("out", 4, 2), ("other", 40, 3)):
+        Simulation(scene, device=device).run(
+            frames, output=tmp_path / name / "out.usda", on_frame=lambda frame, last=last: frame < last
+        )
+    saved, other = (dict(np.load(tmp_path / name / "out.resume.npz")) for name in ("out", "other"))
+    np.savez(tmp_path / "out" / "out.resume.npz", **FOREIGN[kind](saved, other))
+    cache = (tmp_path / "out" / "out.cache.usdc").read_bytes()
+    output = tmp_path / "out" / "out.usda"
+    assert cli.main(["run", str(scene), "--frames", "4", "-o", str(output), "--device", device, "--resume"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("warpmag: ") and "resume" in line
+    if "file" in kind or kind in ("of another length", "of no numbers", "of other places", "of fewer values"):
+        assert (tmp_path / "out" / "out.cache.usdc").read_bytes() == cache
+    assert len(frames_of(output)) == 3
+
+
+def test_damaged_references_are_repaired_and_values_recognized(scene, tmp_path, device, always, capsys):
+    """Where a frame's values stand is known without the file; the values themselves have a checksum."""
+    output = tmp_path / "out.usda"
+    Simulation(scene, device=device).run(4, output=output, on_frame=lambda frame: frame < 2)
+    places, cache = dict(np.load(tmp_path / "out.resume.npz")), tmp_path / "out.cache.usdc"
+    content = cache.read_bytes()
+    row, value = int(places["file/times"]) + 8 * (1 + int(places["file/capacity"])) + 16, int(places["file/starts"][0])
+
+    def resume(place):
+        cache.write_bytes(content[:place] + b"\xff" * 4 + content[place + 4 :])
+        return cli.main(["run", str(scene), "--frames", "4", "-o", str(output), "--device", device, "--resume"])
+
+    assert resume(value) == 2
+    assert "cannot be resumed, it has changed" in capsys.readouterr().err
+    assert resume(row) == 0
+    assert len(samples(output)) and len(frames_of(output)) == 5

@@ -191,6 +191,14 @@ def test_metadata_of_the_root(tmp_path, scene):
         assert layer.timeCodesPerSecond == 48.0
 
 
+@pytest.mark.parametrize(("time", "frames"), [(0.667, 16.0), (0.666, 16.0), (0.26, 6.24), (0.04, 1.0)])
+def test_a_stage_ends_at_a_whole_frame(time, frames, tmp_path, scene):
+    """The last step is up to half a step beside a frame. One that is far from any frame has to be shown, too."""
+    write(scene, tmp_path / "run.usda", [0.0, time])
+    stage = Usd.Stage.Open(str(tmp_path / "run.usda"))
+    assert stage.GetEndTimeCode() == pytest.approx(10.0 + 2.0 * frames, abs=1e-9)
+
+
 @pytest.mark.parametrize(
     "rates",
     ["timeCodesPerSecond = 48\n    framesPerSecond = 24", "framesPerSecond = 30", "timeCodesPerSecond = 10", ""],

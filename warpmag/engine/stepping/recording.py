@@ -80,6 +80,8 @@ class Recorder:
         if done > steps:
             raise InputError(f"frames: {output} already has {earlier.time:g} s, more than {frames} frames")
         if earlier.state is not None:
+            if not np.array_equal(earlier.state.get("steps"), done):
+                raise InputError(f"{output}: cannot resume, its checkpoint is of another time")
             names = [name for name in earlier.state if name.startswith(_STATISTICS)]
             try:
                 self._stepper.load(earlier.state)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from warpmag.engine.stepping.stepper import StepReport
+from warpmag.errors import InputError
 
 _COARSE = 1e-3
 """Coarseness of positions above which a warning is issued. Contacts settle to about a thousandth of the thickness."""
@@ -105,10 +106,13 @@ class Statistics:
         return {entry.name: np.array(getattr(self, entry.name)) for entry in fields(self)}
 
     def load(self, saved: dict[str, np.ndarray]) -> None:
-        """Set the values that :meth:`save` returned."""
-        for entry in fields(self):
-            current, value = getattr(self, entry.name), saved[entry.name].tolist()
-            setattr(self, entry.name, array(current.typecode, value) if isinstance(current, array) else value)
+        """Set the values that :meth:`save` returned; others raise :class:`InputError`."""
+        for name, present in self.save().items():
+            current, value = getattr(self, name), saved[name]
+            if value.dtype.kind != present.dtype.kind or value.ndim != present.ndim:
+                raise InputError(f"checkpoint: {name} does not fit this run")
+            entries = value.tolist()
+            setattr(self, name, array(current.typecode, entries) if isinstance(current, array) else entries)
 
     def warnings(self) -> list[str]:
         """Return warnings about the accuracy of the run, one line each."""

@@ -26,7 +26,7 @@ from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.engine.pile_xpbd.capture import Workspace, without_allocations
 from warpmag.engine.pile_xpbd.contacts import BodySizes, RigidSolver
 from warpmag.engine.stepping.keyed_values import KeyedModelValues
-from warpmag.errors import SimulationError
+from warpmag.errors import InputError, SimulationError
 from warpmag.kernels.rigid import monitor, stepping
 from warpmag.kernels.rigid.bodies import predict_poses
 from warpmag.kernels.rigid.newton_views import view_bodies
@@ -263,10 +263,15 @@ class Stepper:
 
     def load(self, saved: dict[str, np.ndarray]) -> None:
         """Continue from the arrays that :meth:`save` returned; another model's arrays raise :class:`InputError`."""
-        self._solver.set_limits(saved["buffers"])
+        limits, steps = saved["buffers"], saved["steps"]
+        if limits.shape != self._solver.limits().shape or steps.shape or {limits.dtype.kind, steps.dtype.kind} != {"i"}:
+            raise InputError("checkpoint: steps and buffers do not fit this run")
+        if not ((limits >= 0) & (limits < 2**31)).all():
+            raise InputError("checkpoint: buffers have sizes out of range")
+        self._solver.set_limits(limits)
         self._prepare()
         restore_snapshot(self._persistent_arrays(), saved)
-        self.steps = self._reported = int(saved["steps"])
+        self.steps = self._reported = int(steps)
 
     def _persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays that the next step depends on, by name."""

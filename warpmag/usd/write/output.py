@@ -27,7 +27,7 @@ from warpmag.usd.values import quiet
 _SUFFIXES = (".usd", ".usda", ".usdc")
 _SCENES = (".usdc", ".usdz")
 _HEADER = "about"
-_FORMAT = 3
+_FORMAT = 4
 """Version of the checkpoint format. Increase it with each change of its content, here or in the engine's state."""
 _UNLOCKABLE = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP)
 """Errors of file systems without locks."""

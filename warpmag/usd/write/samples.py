@@ -20,6 +20,7 @@ reference for each sample. Offsets count from their own places, and a reference 
 import contextlib
 import os
 import struct
+import zlib
 from dataclasses import asdict, dataclass, replace
 from typing import BinaryIO
 
@@ -35,6 +36,9 @@ _FIRST_AHEAD = 64
 _BLOCK = 1 << 17
 """References in memory at once."""
 _FIRST_CAPACITY = 64
+_DIGEST = "digest"
+_FOREIGN = (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError, MemoryError, struct.error)
+"""Errors of places that are not those of the file."""
 
 
 @dataclass
@@ -52,6 +56,7 @@ class _Places:
     size: int = 0  # least size of the file, up to the end of the structure
     filled: int = 0  # number of frames whose references are written
     count: int = 0  # number of frames
+    checksum: int = 0  # CRC-32 of the values of all frames
 
 
 class SampleFile:
@@ -85,15 +90,24 @@ class SampleFile:
 
     @classmethod
     def resume(cls, path: str | os.PathLike, sizes: np.ndarray, places: dict[str, np.ndarray]) -> "SampleFile":
-        """Continue a file from an earlier :meth:`places`; later frames are dropped."""
+        """Continue a file from an earlier :meth:`places`; later frames are dropped.
+
+        A file that has changed, or the places in another file, raise :class:`InputError`, and nothing is written.
+        """
         with contextlib.ExitStack() as stack:
             file = stack.enter_context(open(path, "r+b", buffering=0))
-            fields = {name: value if value.ndim else int(value) for name, value in places.items()}
-            self = cls(file, sizes, _Places(**fields))
-            if not self._is_intact():
+            try:
+                fields = {name: value if value.ndim else int(value) for name, value in places.items()}
+                digest = fields.pop(_DIGEST)
+                self = cls(file, sizes, _Places(**fields))
+                intact = self._is_intact() and np.array_equal(digest, self._digest())
+            except _FOREIGN:
+                intact = False
+            if not intact:
                 raise InputError(f"{path}: cannot be resumed, it has changed since the run wrote it")
             self._set_count(float(self.codes()[-1]))
             self._write_heads(0, len(sizes))
+            self._fill_rows(0, self._places.filled, 0, len(sizes))
             stack.pop_all()
         return self
 
@@ -109,7 +123,22 @@ class SampleFile:
 
     def places(self) -> dict[str, np.ndarray]:
         """Return the state from which :meth:`resume` continues."""
-        return {name: np.asarray(value) for name, value in asdict(self._places).items()}
+        values = asdict(self._places) | {_DIGEST: self._digest()}
+        return {name: np.asarray(value) for name, value in values.items()}
+
+    def _digest(self) -> int:
+        """Return a checksum of all that frames do not change, and of the time codes: a checkpoint knows its file by it.
+
+        Left out are rows, heads and counts, which :meth:`resume` writes anew, and the values of frames.
+        """
+        places, descriptor = self._places, self._file.fileno()
+        layer = bytearray(os.pread(descriptor, int(places.starts[0]), 0))
+        for place, size in ((CONTENTS, 8), (places.end_code, 8), (places.heads, HEAD * len(self._offsets))):
+            layer[place : place + size] = bytes(size)
+        end = self._rows().stop
+        structure = os.pread(descriptor, places.size - end, end)
+        parts = layer, structure, self.codes(), places.types, places.first_frames, places.starts
+        return zlib.crc32(b"".join(map(bytes, parts)))
 
     def append(self, code: float, values: bytes, changed: np.ndarray) -> None:
         """Append a frame: the values of all attributes at a later time code. A frame that fails is not in the file.
@@ -124,12 +153,14 @@ class SampleFile:
         self._write(places.times + 8 * (1 + places.count), struct.pack("<d", code))
         places.sampled[changed] = True
         places.count += 1
+        checksum, places.checksum = places.checksum, zlib.crc32(values, places.checksum)
         try:
             if len(changed):
                 self._write_heads(int(changed.min()), int(changed.max()) + 1)
             self._set_count(code)
         except OSError:
             places.count -= 1
+            places.checksum = checksum
             places.sampled[changed] = False
             raise
 
@@ -182,10 +213,18 @@ class SampleFile:
     def _is_intact(self) -> bool:
         """Return True if the file has its full size and contains the frames of the checkpoint."""
         places, descriptor = self._places, self._file.fileno()
-        if os.fstat(descriptor).st_size < places.size:
+        kinds = [array.dtype.kind for array in (places.types, places.first_frames, places.starts, places.sampled)]
+        if kinds != ["u", "i", "i", "b"] or not len(places.types) == len(places.sampled) == len(self._offsets):
+            return False
+        if os.fstat(descriptor).st_size < places.size or places.filled > places.capacity:
             return False
         (frames,) = struct.unpack("<Q", os.pread(descriptor, 8, places.times))
-        return os.pread(descriptor, len(MAGIC), 0) == MAGIC and places.count <= frames <= places.capacity
+        if not (os.pread(descriptor, len(MAGIC), 0) == MAGIC and 0 < places.count <= frames <= places.capacity):
+            return False
+        checksum = 0
+        for number in range(places.count):
+            checksum = zlib.crc32(self.frame(number), checksum)
+        return checksum == places.checksum
 
     def _rows(self) -> range:
         """Return the places of the rows."""

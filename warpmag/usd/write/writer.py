@@ -38,6 +38,8 @@ from warpmag.usd.write.scene_copy import copy_scene, file_with
 
 _CHECKPOINT_SECONDS = 1.0
 """Least time between checkpoints [s]."""
+_LATE = 0.1
+"""Part of a frame by which the last frame of a stage may be later than a whole one, at which the stage ends."""
 _CHECKPOINT_SHARE = 0.01
 """Largest share of the run time spent on checkpoints."""
 
@@ -362,12 +364,19 @@ class CacheWriter:
         root = Sdf.Layer.CreateAnonymous()
         for key in copied_metadata(scene):
             root.pseudoRoot.SetInfo(key, scene.pseudoRoot.GetInfo(key))
-        # Players stop at whole frames. The last frame is at the nearest step, which may be later, and must be shown.
-        last_frame = round(self._last_time * self._clock.frames_per_second) / self._clock.frames_per_second
-        for key, value in self._metadata(self._code(max(last_frame, self._last_time))).items():
+        for key, value in self._metadata(self._end_code()).items():
             root.pseudoRoot.SetInfo(key, value)
         root.subLayerPaths[:] = [f"./{self._output.cache.name}", *self._sublayers]
         return root
+
+    def _end_code(self) -> float:
+        """Return the last time code of the stage: players stop at whole frames, and the last frame must be shown.
+
+        The last frame is at the nearest step, a little before or after a whole frame unless steps are long.
+        """
+        rate = self._clock.frames_per_second
+        whole = round(self._last_time * rate)
+        return self._code(self._last_time if self._last_time * rate - whole > _LATE else whole / rate)
 
     def _instances_layer(self) -> Sdf.Layer | None:
         """Return the layer with the prims of instances, None if there is none.
