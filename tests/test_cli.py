@@ -365,7 +365,7 @@ def test_a_hidden_gpu_is_no_news(tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-@pytest.mark.parametrize("arguments", [["scenes"], ["check", "balls_up"]])
+@pytest.mark.parametrize("arguments", [["scenes"], ["check", "balls_up"], ["--version"], ["run", "--help"]])
 def test_a_full_standard_output_ends_in_one_line(arguments):
     command = [sys.executable, "-m", "warpmag.cli", *arguments]
     with open("/dev/full", "w", encoding="utf-8") as full:

@@ -124,12 +124,36 @@ def test_without_a_camera_all_bodies_are_in_the_picture(stage, device, tmp_path)
     assert not there[:, 0].any() and not there[:, -1].any()
 
 
+def test_a_camera_that_sees_no_body_is_replaced_unless_it_is_named(stage, device, tmp_path):
+    """Inside the magnet, or turned away: all bodies are shown, and a line names the camera."""
+    opened = Usd.Stage.Open(str(stage))
+    opened.RemovePrim("/World/Camera")
+    authoring.add_camera(opened, (0.0, 0.0, 0.045), (0.0, 0.01, 0.045))  # in the middle of the magnet
+    Usd.Stage.GetRootLayer(opened).Export(str(tmp_path / "inside.usda"))
+    opened.GetRootLayer().Reload(force=True)
+    lines, pictures = [], {}
+    for name in (None, "auto", "/World/Camera"):
+        pictures[name] = drawn(
+            tmp_path / "inside.usda", tmp_path / "one.png", device, camera=name, on_camera=lines.append
+        )
+    assert lines[0] == "all bodies, as the camera /World/Camera sees none or one from inside"
+    assert lines[1:] == ["all bodies", "camera /World/Camera"]
+    np.testing.assert_array_equal(pictures[None], pictures["auto"])
+    assert red(pictures[None]).any() and not np.array_equal(pictures[None], pictures["/World/Camera"])
+    drawn(stage, tmp_path / "one.png", device, on_camera=lines.append)
+    assert lines[-1] == "camera /World/Camera"
+
+
 def test_bad_input_is_one_line(stage, tmp_path, capsys):
     (tmp_path / "file").touch()
     for arguments, text in (
         (["-o", str(tmp_path / "file" / "a.png")], "a.png: cannot be written ("),
         (["-o", "picture.jpg"], "picture.jpg: a picture is written as .png, a film as .mp4 or .gif"),
         (["-o", str(tmp_path / "a.png"), "--frame", "-1"], "has frames 0 to"),
+        (
+            ["-o", str(tmp_path / "a.png"), "--camera", "/World"],
+            "no perspective camera of the stage; there are auto",
+        ),
         (["-o", str(tmp_path / "a.png"), "--frames", "3:2"], "got 3 to 2"),
         (["-o", str(tmp_path / "a.png"), "--frames", "all"], "frames: must be two whole numbers such as 10:20"),
         (["-o", str(tmp_path / "a.png"), "--size", "1280"], "size: must be two whole numbers such as 10x20"),

@@ -228,14 +228,17 @@ def _render(options) -> int:
 
         if options.frames or options.arrows:
             raise InputError("quality: 'final' draws one frame without arrows; 'warpmag export --arrows' draws them")
+        if options.camera:
+            raise InputError("camera: goes with the quality 'draft' only; 'final' draws the first camera")
         size = _pair("size", options.size, "x")
         print(f"written {render_final(path, options.output, frame=options.frame, size=size)}")
         return 0
     from warpmag.show.ray_tracing import render  # noqa: PLC0415
 
     frames = _pair("frames", options.frames, ":") if options.frames is not None else None
-    settings = {"size": _pair("size", options.size, "x"), "arrows": options.arrows, "device": options.device}
-    written = render(path, options.output, frame=options.frame, frames=frames, **settings)
+    settings = {name: getattr(options, name) for name in ("arrows", "camera", "device", "frame")}
+    settings |= {"size": _pair("size", options.size, "x"), "frames": frames}
+    written = render(path, options.output, **settings, on_camera=lambda line: print(f"drawn   {line}"))
     print(f"written {written[0]}{f' to {written[-1].name}' if len(written) > 1 else ''}")
     return 0
 

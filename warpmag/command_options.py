@@ -2,6 +2,7 @@
 
 import argparse
 import re
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
@@ -43,12 +44,18 @@ _EXAMPLES = """
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that raises :class:`InputError`, and reads numbers such as -8e4 as values."""
+    """A parser that raises :class:`InputError`, and reads numbers such as -8e4 as values.
+
+    Help that cannot be written raises ``OSError``.
+    """
 
     def __init__(self, *arguments, **named):
         """Keep the lines of the examples as they are."""
         super().__init__(*arguments, **named, formatter_class=argparse.RawDescriptionHelpFormatter)
         self._negative_number_matcher = re.compile(r"-\d*\.?\d+(e[-+]?\d+)?$", re.IGNORECASE)
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        print(message, end="", file=file or sys.stderr, flush=True)
 
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message} (see {self.prog} --help)")
@@ -159,6 +166,8 @@ def _add_render(render: argparse.ArgumentParser) -> None:
     add("--quality", choices=("draft", "final"), default="draft", help=text)
     add("--arrows", action="store_true", help="draw the moments of a finished run as arrows")
     add("--moments", dest="arrows", action=_Renamed, nargs=0, const=True, help=argparse.SUPPRESS)
+    text = "path of a camera, or auto for a view of all bodies (default: the first camera, auto if it sees no body)"
+    add("--camera", metavar="PATH", help=text)
     add("--device", help=_DEVICE)
 
 

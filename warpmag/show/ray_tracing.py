@@ -1,8 +1,8 @@
 """Draws frames of a stage by ray tracing on any device, as pictures or films, without an external renderer.
 
 The stage may be a scene or the recording of a run: bodies stand at the poses of their time samples. Newton's camera
-sensor traces the model. It uses the shapes, colors and first camera of the stage. Without a camera, the view shows all
-bodies from the front and above.
+sensor traces the model. It uses the shapes, colors and first camera of the stage. Without a camera that sees bodies,
+the view shows all bodies from the front and above.
 
 Newton's camera returns the light that each surface scatters. A metal scatters none: it mirrors its surroundings, here a
 sky that brightens towards the horizon, a ground and a sun. Fresnel's reflectance is approximated (Schlick 1994).
@@ -14,6 +14,7 @@ Reflections of other bodies are left out.
 
 import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag.declarations.checks import short_repr
 from warpmag.deprecation import renamed_arguments
 from warpmag.engine.newton_versions import camera_type
 from warpmag.engine.stepping.scene import ImportedScene, import_scene
@@ -28,7 +30,15 @@ from warpmag.errors import InputError
 from warpmag.moments.arrays import resolve_device
 from warpmag.show import films
 from warpmag.show.materials import metalness
-from warpmag.usd import Playback, StageClock, first_camera, open_deferred, stage_clock
+from warpmag.usd import (
+    Playback,
+    StageClock,
+    newton_errors,
+    open_deferred,
+    perspective_cameras,
+    quiet,
+    stage_clock,
+)
 
 _SAMPLES = 3
 """Rays per pixel along each of its sides."""
@@ -44,6 +54,10 @@ _AMBIENT = ((0.5, 0.53, 0.58), (0.22, 0.21, 0.2))
 """Linear radiance from above and from below."""
 _ZENITH, _HORIZON = np.array((0.42, 0.5, 0.62)), np.array((0.80, 0.83, 0.86))
 _GROUND = np.array((0.16, 0.155, 0.15))
+AUTO = "auto"
+"""Name of the view of all bodies, in place of a camera's."""
+_LOOK = (18, 32)
+"""Rows and columns of rays that find out whether a camera sees bodies."""
 _HIGHLIGHT, _SHARPNESS = 4.0, 180.0
 """Radiance of the sun's reflection in a polished surface, and the exponent by which it fades (Phong 1975)."""
 
@@ -57,7 +71,9 @@ def render(
     frames: tuple[int, int] | None = None,
     size: tuple[int, int] = (960, 540),
     arrows: bool = False,
+    camera: str | None = None,
     device: str | None = None,
+    on_camera: Callable[[str], None] | None = None,
 ) -> list[Path]:
     """Draw a stage.
 
@@ -68,13 +84,16 @@ def render(
         frames: First and last frame of several; the name of each picture contains the number of its frame.
         size: Width and height [px].
         arrows: Draw the moments of the recording as arrows.
+        camera: Prim path of a perspective camera, or ``auto`` for a view of all bodies. By default the first camera of
+            the stage, or ``auto`` if it sees no body, or nothing else than one shape, as from inside it.
         device: Warp device; by default Warp's.
+        on_camera: Called with a line of text that names the camera.
 
     Returns:
         The files written.
 
     Raises:
-        InputError: The stage cannot be read, has no such frames or no moments, or the pictures cannot be written.
+        InputError: The stage cannot be read, has no such frames, camera or moments, or the pictures cannot be written.
     """
     output = Path(output)
     films.check_name(output)
@@ -86,6 +105,9 @@ def render(
     with wp.ScopedDevice(resolve_device(device)):
         scene = import_scene(stage, visuals=True, time_code=min(codes[0], clock.end))
         renderer = _Renderer(scene, stage, size, arrows)
+        line = renderer.choose_camera(camera)
+        if on_camera:
+            on_camera(line)
         pictures = (renderer.picture(code) for code in codes)
         return films.write(output, pictures, numbers, clock.frames_per_second)
 
@@ -109,7 +131,8 @@ class _Renderer:
     def __init__(self, scene: ImportedScene, path, size: tuple[int, int], arrows: bool):
         self._scene, self._motion, (self._width, self._height) = scene, Playback(scene.stage, scene.swarms), size
         self._arrows = _Arrows(scene, path) if arrows else None
-        self._model = model = scene.builder.finalize()
+        with newton_errors(str(path), "use"):
+            self._model = model = scene.builder.finalize()
         self._state = model.state()
         ray_tracer = camera_type()
         self._camera = camera = ray_tracer(model, load_textures=False)
@@ -125,9 +148,29 @@ class _Renderer:
             for prim, labels in swarm.copies_of(model.shape_label).items()
             for label in labels
         }
-        metal = {label: metalness(scene.stage, label) for label in model.shape_label if label not in sources}
+        with quiet():
+            metal = {label: metalness(scene.stage, label) for label in model.shape_label if label not in sources}
         self._metal = np.array([metal[sources.get(label, label)] for label in model.shape_label])
-        self._view = _view(scene, model, camera, _SAMPLES * self._width, _SAMPLES * self._height)
+
+    def choose_camera(self, name: str | None) -> str:
+        """Set the camera of all pictures, see :func:`render`; return a line of text that names it."""
+        size = _SAMPLES * self._width, _SAMPLES * self._height
+        prim = None if name == AUTO else _camera_prim(self._scene.stage, name)
+        if prim:
+            self._view = _view_of(prim, self._camera, *size)
+            if name or self._sees_bodies():
+                return f"camera {prim.GetPath()}"
+        self._view = _view_of_bodies(self._model, self._camera, *size)
+        return f"all bodies, as the camera {prim.GetPath()} sees none or one from inside" if prim else "all bodies"
+
+    def _sees_bodies(self) -> bool:
+        """Return True if the view shows a body, or without bodies a shape, and something else beside it."""
+        self._model.bvh_refit_shapes(self._state)
+        all_rays, pose = self._view
+        steps = [max(1, count // least) for count, least in zip(all_rays.shape[:2], _LOOK, strict=True)]
+        rays = np.ascontiguousarray(all_rays[:: steps[0], :: steps[1]])
+        _, _, shapes = self._trace(rays, wp.array([pose], dtype=wp.transformf, device=self._model.device))
+        return bool(np.isin(shapes, _shown(self._model)).any()) and len(np.unique(shapes)) > 1
 
     def picture(self, time_code: float) -> np.ndarray:
         """Return the picture at a time code as 8-bit sRGB, shape [height, width, 3]."""
@@ -152,7 +195,7 @@ class _Renderer:
 
     def _trace(self, rays: np.ndarray, poses: wp.array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return scattered light, normals and shapes (-1 where a ray hits none), shape [height, width, ...]."""
-        camera, shape = self._camera, (1, self._width, self._height)
+        camera, shape = self._camera, (1, rays.shape[1], rays.shape[0])
         light: Any = camera.allocate_image_color_hdr(*shape)
         normals: Any = camera.allocate_image_normal(*shape)
         shapes: Any = camera.allocate_image_shape_index(*shape)
@@ -197,22 +240,40 @@ class _Arrows:
         model.shape_transform.assign(frames)
 
 
-def _view(scene: ImportedScene, model: newton.Model, camera: Any, width: int, height: int) -> tuple[Any, Any]:
-    """Return the rays in the frame of the camera, shape [height, width, 1, 2, 3], and the pose of the camera."""
-    prim = first_camera(scene.stage)
-    if prim:
-        rays: Any = camera.compute_camera_rays_pinhole_usd(width, height, prim, device="cpu")
-        return rays.numpy(), wp.transform(*camera.compute_camera_transforms_usd(prim).numpy()[0])
+def _camera_prim(stage, name: str | None):
+    """Return the camera of a prim path, by default the first of the stage, or None without one."""
+    cameras = perspective_cameras(stage)
+    matching = [prim for prim in cameras if name in (None, str(prim.GetPath()))]
+    if matching or name is None:
+        return next(iter(matching), None)
+    known = ", ".join([AUTO, *(str(prim.GetPath()) for prim in cameras)])
+    raise InputError(f"camera: {short_repr(name)} is no perspective camera of the stage; there are {known}")
+
+
+def _view_of(prim, camera: Any, width: int, height: int) -> tuple[Any, Any]:
+    """Return the rays in the frame of a camera, shape [height, width, 1, 2, 3], and the pose of the camera."""
+    rays: Any = camera.compute_camera_rays_pinhole_usd(width, height, prim, device="cpu")
+    return rays.numpy(), wp.transform(*camera.compute_camera_transforms_usd(prim).numpy()[0])
+
+
+def _view_of_bodies(model: newton.Model, camera: Any, width: int, height: int) -> tuple[Any, Any]:
+    """Return :func:`_view_of` a camera that looks at all bodies."""
     field = min(_FIELD_OF_VIEW, 2.0 * math.atan(math.tan(0.5 * _FIELD_OF_VIEW) * height / width))
     rays = camera.compute_camera_rays_pinhole(width, height, camera_fov=field, device="cpu")
     return rays.numpy(), _looking_at_bodies(model, field)
+
+
+def _shown(model: newton.Model) -> np.ndarray:
+    """Return the indices of all shapes of bodies, or of all shapes without any."""
+    shape_body = model.shape_body.numpy()
+    return np.flatnonzero(shape_body >= 0) if (shape_body >= 0).any() else np.arange(model.shape_count)
 
 
 def _looking_at_bodies(model: newton.Model, field: float) -> wp.transform:
     """Return a camera pose that sees all shapes of bodies, or all shapes without any, in a view of ``field`` [rad]."""
     shape_body, poses = model.shape_body.numpy(), model.body_q.numpy()
     frames, radii = model.shape_transform.numpy(), model.shape_collision_radius.numpy()
-    shown = np.flatnonzero(shape_body >= 0) if (shape_body >= 0).any() else np.arange(model.shape_count)
+    shown = _shown(model)
     centers = np.zeros((len(shown), 3))
     for row, shape in enumerate(shown):
         origin, body = wp.vec3(*frames[shape, :3]), shape_body[shape]

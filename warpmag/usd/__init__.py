@@ -17,11 +17,11 @@ from warpmag.usd.read.input_errors import newton_errors, usd_errors
 from warpmag.usd.read.instancers import complete_instances
 from warpmag.usd.read.joints import GroundedJoint, enabled_joint_paths, prepare_joints
 from warpmag.usd.read.materials import give_densities
-from warpmag.usd.read.opening import describe, first_camera, freeze, open_animated, open_deferred, open_stage
+from warpmag.usd.read.opening import describe, freeze, open_animated, open_deferred, open_stage, perspective_cameras
 from warpmag.usd.read.prims import has_volume
 from warpmag.usd.read.recording import Playback, Recording, read_recording
 from warpmag.usd.read.survey import StageContents, read_magnets, survey
-from warpmag.usd.values import Finding
+from warpmag.usd.values import Finding, quiet
 from warpmag.usd.write.model_stage import ModelStage, StageBody, StageShape
 from warpmag.usd.write.writer import CacheWriter, PreviousRun
 
@@ -30,8 +30,8 @@ __all__ = [
     "ModelStage", "Playback", "PreviousRun", "Recording", "StageBody", "StageClock", "StageContents", "StageReport",
     "StageShape", "author_coil",
     "author_field_map", "author_magnet", "author_settings", "ball_instancers", "check", "collider_magnet",
-    "complete_instances", "describe", "enabled_joint_paths", "first_camera", "freeze", "give_densities", "has_volume",
-    "inspect", "is_source", "magnet_of", "newton_errors", "open_animated", "open_deferred", "open_stage",
-    "placed_sources", "prepare_joints", "read_magnets", "read_recording", "shape_axis", "stage_clock", "survey",
-    "triangulate_concave_faces", "usable_path", "usd_errors", "world_matrix_at",
+    "complete_instances", "describe", "enabled_joint_paths", "freeze", "give_densities", "has_volume", "inspect",
+    "is_source", "magnet_of", "newton_errors", "open_animated", "open_deferred", "open_stage", "perspective_cameras",
+    "placed_sources", "prepare_joints", "quiet", "read_magnets", "read_recording", "shape_axis", "stage_clock",
+    "survey", "triangulate_concave_faces", "usable_path", "usd_errors", "world_matrix_at",
 ]  # fmt: skip

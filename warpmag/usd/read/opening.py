@@ -215,12 +215,11 @@ def _files(attribute: Usd.Attribute, text: str) -> set[str]:
     return {text, *(Sdf.ComputeAssetPathRelativeToLayer(layer, text) for layer in layers if not layer.anonymous)}
 
 
-def first_camera(stage: Usd.Stage) -> Usd.Prim | None:
-    """Return the first perspective camera of a stage, None where there is none."""
-    for prim in stage.Traverse():
-        if prim.IsA(UsdGeom.Camera) and UsdGeom.Camera(prim).GetProjectionAttr().Get() == UsdGeom.Tokens.perspective:
-            return prim
-    return None
+def perspective_cameras(stage: Usd.Stage) -> list[Usd.Prim]:
+    """Return the perspective cameras of a stage, in its order."""
+    cameras = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
+    perspective = UsdGeom.Tokens.perspective
+    return [prim for prim in cameras if UsdGeom.Camera(prim).GetProjectionAttr().Get() == perspective]
 
 
 def describe(path: str | os.PathLike) -> str:
