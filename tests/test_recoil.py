@@ -216,6 +216,7 @@ def pushes(*arguments, **settings):
     return pair(*arguments, **settings)[1].body_f.numpy().astype(float)
 
 
+@pytest.mark.filterwarnings("ignore::warpmag.ConvergenceWarning")  # rounding of the bias M_r/χ exceeds this rtol
 @pytest.mark.parametrize("place", [(0.0, 0.0, 0.01), (0.003, 0.0, 0.0101), (0.0104, 0.0, 0.004)])
 def test_magnets_that_hardly_yield_pull_as_those_that_do_not(place, device):
     """0.5 %: μ − 1 of 1e-3 takes 7e-4 of the force; moments alone leave 2 % of it where faces touch."""

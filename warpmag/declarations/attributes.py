@@ -10,7 +10,7 @@ from dataclasses import MISSING, dataclass, fields, replace
 from functools import cache
 from typing import Any, Literal, get_type_hints
 
-from warpmag.declarations.checks import check_token
+from warpmag.declarations.checks import check_token, plain_value
 
 NAMESPACE = "warpmag"
 """Namespace of attributes in USD and in Newton models."""
@@ -74,6 +74,22 @@ def check_fields(record: Any, owner: str, *names: str) -> None:
     for row in attributes_of(type(record)):
         if row.field in names:
             row.check_value(owner, getattr(record, row.field))
+
+
+def make_plain(record: Any) -> None:
+    """Replace values of a frozen record by :func:`plain_value`; :class:`InputError` names a field that has none."""
+    for row in attributes_of(type(record)):
+        value = getattr(record, row.field)
+        if isinstance(value, float | int | str) or (
+            isinstance(value, tuple) and all(isinstance(v, float) for v in value)
+        ):
+            continue  # as nearly always
+        value = plain_value(row.field, value)
+        if getattr(value, "shape", None) == (1, 3):  # a Warp array of one vector
+            value = value[0]
+        if isinstance(value, list | tuple):
+            value = tuple(plain_value(row.field, component) for component in value)
+        object.__setattr__(record, row.field, value)
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,23 @@ def short_repr(value: Any) -> str:
     return " ".join(_REPR.repr_instance(value, 0).split())
 
 
+def plain_value(name: str, value: Any) -> Any:
+    """Return a Warp scalar as a number, and an array of Warp, PyTorch or the like as NumPy; others unchanged.
+
+    A tensor that NumPy cannot read, on a GPU or with gradients, raises :class:`InputError`.
+    """
+    if callable(convert := getattr(value, "numpy", None)):
+        try:
+            return convert()
+        except Exception as error:  # libraries raise errors of several types
+            raise InputError(f"{name}: cannot be read as a NumPy array ({error})") from error
+    number = getattr(value, "value", None)  # of a Warp scalar
+    return number if isinstance(number, numbers.Real) else value
+
+
 def real_number(name: str, value: Any) -> float:
     """Return one real number as a float; raise :class:`InputError` for anything else, including a bool."""
-    plain = value
+    plain = value = plain_value(name, value)
     if getattr(value, "shape", None) == () and hasattr(value, "item") and not getattr(value, "mask", False):
         plain = value.item()
     if isinstance(plain, bool) or not isinstance(plain, numbers.Real):
@@ -60,14 +74,24 @@ def check_not_negative(name: str, value: Any) -> None:
 
 def check_vector(name: str, values: Any) -> None:
     """Raise :class:`InputError` unless ``values`` are three finite numbers."""
+    vector(name, values)
+
+
+def vector(name: str, values: Any) -> tuple[float, float, float]:
+    """Return three finite numbers; raise :class:`InputError` for anything else."""
+    values = plain_value(name, values)
+    if getattr(values, "shape", None) == (1, 3):  # a Warp array of one vector
+        values = values[0]
     try:
         three = len(values) == 3
     except TypeError:  # len() of a zero-dimensional NumPy array raises
         three = False
     if not three:
         raise InputError(f"{name}: must be three numbers, got {short_repr(values)}")
-    if not all(math.isfinite(real_number(name, component)) for component in values):
-        raise InputError(f"{name}: must be finite, got {tuple(float(component) for component in values)}")
+    x, y, z = (real_number(name, component) for component in values)
+    if not all(map(math.isfinite, (x, y, z))):
+        raise InputError(f"{name}: must be finite, got {(x, y, z)}")
+    return x, y, z
 
 
 def check_flag(name: str, value: Any) -> None:

@@ -13,8 +13,8 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from warpmag.declarations.attributes import Attribute, check_fields
-from warpmag.declarations.checks import check_flag, check_positive, check_vector, real_number, short_repr
+from warpmag.declarations.attributes import Attribute, check_fields, make_plain
+from warpmag.declarations.checks import check_flag, check_positive, check_vector, real_number, short_repr, vector
 from warpmag.errors import InputError
 
 COIL_SHAPES = ("loop", "solenoid", "polyline")
@@ -43,14 +43,13 @@ def check_strength(name: str, value: Any) -> None:
 def check_size(name: str, value: Any) -> None:
     """Raise :class:`InputError` unless ``value`` is a length [m] within :data:`SIZE_RANGE`."""
     check_positive(name, value)
-    if not SIZE_RANGE[0] <= value <= SIZE_RANGE[1]:
-        raise InputError(f"{name}: must be from {SIZE_RANGE[0]:g} to {SIZE_RANGE[1]:g} m, got {float(value):g}")
+    if not SIZE_RANGE[0] <= (size := real_number(name, value)) <= SIZE_RANGE[1]:
+        raise InputError(f"{name}: must be from {SIZE_RANGE[0]:g} to {SIZE_RANGE[1]:g} m, got {size:g}")
 
 
 def check_spacing(name: str, value: Any) -> None:
     """Raise :class:`InputError` unless ``value`` is three lengths [m] within :data:`SIZE_RANGE`."""
-    check_vector(name, value)
-    for step in value:
+    for step in vector(name, value):
         check_size(name, step)
 
 
@@ -132,6 +131,10 @@ class Coil:
         unit="ampere", range=f"[-{LARGEST_STRENGTH:g}, {LARGEST_STRENGTH:g}]", check=check_strength,
     )] = 0.0  # fmt: skip
 
+    def __post_init__(self):
+        """Make numbers of Warp and arrays of other libraries plain."""
+        make_plain(self)
+
     def check(self, name: str) -> None:
         """Raise :class:`InputError` naming ``name`` (a prim path or a function) if a value is out of range."""
         check_fields(self, name, "shape", "closed", "ampere_turns")
@@ -210,6 +213,10 @@ class FieldMap:
         unit="dimensionless", range=f"[-{LARGEST_STRENGTH:g}, {LARGEST_STRENGTH:g}]", check=check_strength,
         uniform=True,
     )] = 1.0  # fmt: skip
+
+    def __post_init__(self):
+        """Make numbers of Warp and arrays of other libraries plain."""
+        make_plain(self)
 
     def check(self, name: str) -> None:
         """Raise :class:`InputError` naming ``name`` (a prim path or a function) if a value is out of range."""

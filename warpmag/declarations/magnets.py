@@ -4,12 +4,20 @@ Stages, the command line and scripts check values through these records.
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, Any
 
-from warpmag.declarations.attributes import Attribute, attributes_of, check_fields
-from warpmag.declarations.checks import check_not_negative, check_positive, check_token, check_vector, real_number
+from warpmag.declarations.attributes import Attribute, attributes_of, check_fields, make_plain
+from warpmag.declarations.checks import (
+    check_not_negative,
+    check_positive,
+    check_token,
+    check_vector,
+    real_number,
+    vector,
+)
 from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.measured import MEASURED_CURVES
 from warpmag.errors import InputError
@@ -36,6 +44,9 @@ MATERIAL_RANGE = {"float32": (1e-12, 1e15), "float64": (1e-100, 1e100)}
 """Smallest and largest saturation [A/m] and finite susceptibility, by the precision of a solve."""
 _MATERIAL_TEXT = f"[{MATERIAL_RANGE['float32'][0]:g}, {MATERIAL_RANGE['float32'][1]:g}]"
 
+MAGNET_SIZES = (1e-8, 2e4)
+"""Smallest and largest radius or half side [m] of a magnetic shape: its moment and the moment's square stay in float32.
+"""
 _RECOIL_RANGE = (1.001, 10.0)
 """Smallest recoil permeability above 1 that float32 resolves, and a limit above all magnets: AlNiCo reaches 5."""
 
@@ -57,11 +68,19 @@ def check_material(name: str, value: Any, *, infinite: bool = False) -> None:
         raise InputError(f"{name}: must be {least:g} to {most:g}, got {float(value):g}")
 
 
+def check_sizes(name: str, lengths: Iterable[float]) -> None:
+    """Raise :class:`InputError` for a radius or half side of a magnetic shape [m] outside :data:`MAGNET_SIZES`."""
+    least, most = MAGNET_SIZES
+    for length in lengths:
+        if not least <= length <= most:
+            raise InputError(f"{name}: sizes must be from {least:g} to {most:g} m, got {length:g}")
+
+
 def check_magnetization(name: str, value: Any) -> None:
     """Raise :class:`InputError` unless ``value`` is a magnetization with fields that single precision resolves."""
-    check_vector(name, value)
-    if not max(abs(float(component)) for component in value) <= (most := MATERIAL_RANGE["float32"][1]):
-        raise InputError(f"{name}: components must be at most {most:g}, got {tuple(map(float, value))}")
+    components = vector(name, value)
+    if not max(map(abs, components)) <= (most := MATERIAL_RANGE["float32"][1]):
+        raise InputError(f"{name}: components must be at most {most:g}, got {components}")
 
 
 def check_recoil(name: str, value: Any) -> None:
@@ -144,7 +163,8 @@ class Magnet:
     )] = 0.0  # fmt: skip
 
     def __post_init__(self):
-        """Set saturation and susceptibility to those of a measured curve."""
+        """Make all values plain, and set saturation and susceptibility to those of a measured curve."""
+        make_plain(self)
         if isinstance(self.curve, MagnetizationCurve):
             object.__setattr__(self, "saturation", self.curve.saturation)
             object.__setattr__(self, "susceptibility", self.curve.susceptibility)
@@ -201,6 +221,10 @@ class MagneticSettings:
         "Relative error of the magnetization at which the induction of a step ends.",
         unit="dimensionless", range=f"[{ACCURACY['float32']:g}, inf)", check=check_rtol,
     )] = 1e-3  # fmt: skip
+
+    def __post_init__(self):
+        """Make numbers of Warp and arrays of other libraries plain."""
+        make_plain(self)
 
     def check(self, name: str) -> None:
         """Raise :class:`InputError` naming ``name`` if a value is out of range, or values are incompatible."""

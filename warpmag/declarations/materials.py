@@ -10,7 +10,7 @@ import math
 import warnings
 from dataclasses import dataclass
 
-from warpmag.declarations.checks import check_positive, check_vector, short_repr
+from warpmag.declarations.checks import check_positive, real_number, short_repr, vector
 from warpmag.declarations.curves import MU0, MagnetizationCurve
 from warpmag.declarations.magnets import check_curve
 from warpmag.declarations.measured import MEASURED_CURVES
@@ -174,18 +174,18 @@ def magnetization_from(magnetization, remanence, material, direction) -> tuple[f
     if magnetization is not None:
         if direction is not None:
             raise InputError("direction: goes with remanence or material; magnetization has its own")
-        check_vector("magnetization", magnetization)
-        return magnetization
+        return vector("magnetization", magnetization)
     if direction is None:
         raise InputError(f"direction: {given[0]} needs the direction of the magnetization")
-    check_vector("direction", direction)
+    direction = vector("direction", direction)
     if material is not None:
         return permanent("material", material, direction)
     check_positive("remanence", remanence)
     length = math.hypot(*direction)
     if not length > 0.0:
         raise InputError("direction: must not be zero")
-    x, y, z = (remanence / MU0 / length * component for component in direction)
+    strength = real_number("remanence", remanence) / MU0
+    x, y, z = (strength / length * component for component in direction)
     return x, y, z
 
 

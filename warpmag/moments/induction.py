@@ -41,6 +41,8 @@ _PLAUSIBLE = {wp.float32: (1e-15, 1e15), wp.float64: (1e-100, 1e100)}
 class InductionResult:
     """Magnetic equilibrium of n balls, returned by :func:`solve_induction`.
 
+    A result can be pickled and copied. A copy has NumPy arrays and no :meth:`wrench`.
+
     Attributes:
         magnetizations: M [A/m], shape [n, 3].
         h_field: Field H at the balls [A/m], without a ball's own, shape [n, 3].
@@ -60,10 +62,15 @@ class InductionResult:
     evaluations: int
     converged: bool
     field_error: float
-    _system: MomentSystem = field(repr=False)
+    _system: MomentSystem | None = field(repr=False)
     _context: CallContext = field(repr=False)
     _arguments: dict = field(repr=False)
     _count: int = field(repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields without those on the device, for pickle and copy."""
+        state = dict.fromkeys(vars(self)) | {name: value for name, value in vars(self).items() if name[0] != "_"}
+        return {name: value.numpy() if isinstance(value, wp.array) else value for name, value in state.items()}
 
     def wrench(self, force: str = "kelvin") -> tuple[Any, Any]:
         """Return force and torque on each ball, from the other balls, permanent moments and the external field.
@@ -78,7 +85,7 @@ class InductionResult:
 
         Raises:
             InputError: The force law is unknown, a force is not finite, or moments are too small for forces in this
-                precision.
+                precision. Or the result is a copy, without the moments on the device.
 
         Example:
             >>> import warpmag
@@ -89,6 +96,8 @@ class InductionResult:
             >>> bool(forces[0, 2] > 0.0)  # the balls attract each other along the field
             True
         """
+        if self._system is None:
+            raise InputError("wrench: a copied or unpickled result has no moments on a device, call wrench() before")
         system, dtype = self._system, self._context.dtype
         system.apply_forces(force)
         strongest = largest(system.moments)

@@ -378,6 +378,20 @@ class MomentSystem:
         material = {"saturation": self.material.saturation, "slope": self.material.slope}
         return {"moments": self.moments, **material, **inner}
 
+    def field_arrays(self) -> list[wp.array]:
+        """Return the arrays that the caller writes before a solve, and the field that it leaves.
+
+        Restoring them with :meth:`persistent_arrays`, and calling :meth:`evaluate_again`, brings back the last solve.
+        """
+        names = {
+            self: ("positions", "rotations", "bias", "h"),
+            self.sources: ("frames", "strengths", "solid_frames"),
+            self.source_interaction: ("source_motion",),
+            self.eddy: ("motion",),
+        }
+        arrays = [getattr(owner, name, None) for owner in names for name in names[owner]]
+        return [array for array in arrays if isinstance(array, wp.array)]
+
     def solve(self):
         """Launch the induction solve: bring the inducible ``moments`` to equilibrium at ``positions``."""
         self.begin()
@@ -439,6 +453,12 @@ class MomentSystem:
             self._cells.launch()
         self._add_cell_pairs()
         self._wait_for_near_contacts()
+
+    def evaluate_again(self):
+        """Launch all that a solve computes from ``positions`` and ``moments``, without a step of the dynamics."""
+        self.begin()
+        if self._inducible_field.count:
+            self.evaluate()
 
     def _add_cell_pairs(self):
         """Launch the corrections of the field between cells of different bodies."""

@@ -31,8 +31,12 @@ _SOURCE_ATTRIBUTES = {
     "current_keys": (str, ""),  # text of the ``Keys`` of a coil's current; empty where it is constant
 }
 """Warp type and default of the attributes of sources."""
-_measured_curves: list[MagnetizationCurve] = []
-"""Measured curves of all shapes; a model stores the index in this list plus the length of ``CURVES``."""
+_measured_curves: dict[MagnetizationCurve, int] = {}
+_curve_of_number: dict[int, str | MagnetizationCurve] = dict(enumerate(CURVES))
+"""Numbers of measured curves and their inverse, with tokens first: a model stores numbers.
+
+Equal curves share a number. A curve stays as long as the process, because models do not tell when they end.
+"""
 
 
 def declare_attributes(builder: newton.ModelBuilder, usd_value: Callable[[Any, dict], Any] | None = None) -> None:
@@ -86,9 +90,9 @@ def _stored(row: Attribute, value: Any) -> Any:
     if row.field == "curve":
         if not isinstance(value, MagnetizationCurve):
             return CURVES.index(value)
-        if value not in _measured_curves:
-            _measured_curves.append(value)
-        return len(CURVES) + _measured_curves.index(value)
+        number = _measured_curves.setdefault(value, len(CURVES) + len(_measured_curves))
+        _curve_of_number[number] = value
+        return number
     if row.usd_type == "vector3f":
         return wp.vec3(*(float(component) for component in value))
     return float(value)
@@ -144,7 +148,7 @@ def _magnet_of(values: list[np.ndarray]) -> Magnet:
         if row.field == "kind":
             fields["kind"] = KINDS[int(value[0]) - 1]
         elif row.field == "curve":
-            fields["curve"] = (*CURVES, *_measured_curves)[int(value[0])]
+            fields["curve"] = _curve_of_number[int(value[0])]
         else:
             fields[row.field] = tuple(value.tolist()) if row.usd_type == "vector3f" else float(value[0])
     return Magnet(**fields)

@@ -11,10 +11,11 @@ import warp as wp
 from warpmag.declarations import materials
 from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.likely_units import warn_of_magnetization, warn_of_radius
-from warpmag.declarations.magnets import Magnet
+from warpmag.declarations.magnets import Magnet, check_sizes
 from warpmag.deprecation import keyword_arguments
 from warpmag.engine.magnets.attributes import check_registered, mark_shapes
 from warpmag.engine.magnets.body_mass import give_density
+from warpmag.engine.magnets.sampling import lengths_of
 from warpmag.engine.magnets.selection import selected
 from warpmag.errors import InputError
 
@@ -190,13 +191,15 @@ def magnet_shapes(builder: newton.ModelBuilder, *, body: int | str | None = None
         ]
         if not colliding:
             raise InputError(f"{builder.body_label[index]}: has no colliding solid shape yet, add its shapes first")
-        shapes += colliding
+        shapes += [_solid(builder, number) for number in colliding]
     return shapes
 
 
 def _solid(builder: newton.ModelBuilder, shape: int) -> int:
-    """Return ``shape``; raise :class:`InputError` unless it has a volume."""
+    """Return ``shape``; raise :class:`InputError` unless it has a volume and valid sizes."""
     if builder.shape_type[shape] not in _SOLID:
         kind = newton.GeoType(builder.shape_type[shape]).name.lower()
         raise InputError(f"{builder.shape_label[shape]}: a {kind} has no volume to magnetize")
+    if lengths := lengths_of(builder.shape_type[shape], builder.shape_scale[shape]):
+        check_sizes(builder.shape_label[shape], lengths)
     return shape

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warpmag.declarations.attributes import NAMESPACE
-from warpmag.declarations.checks import check_whole, short_repr
+from warpmag.declarations.checks import check_whole, plain_value, short_repr
 from warpmag.declarations.coils import LARGEST_POINT, Coil, FieldMap, SourceRecord, checked_vectors
 from warpmag.deprecation import keyword_arguments
 from warpmag.engine.magnets.attributes import check_registered
@@ -71,7 +71,7 @@ def add_coil(
         corners = checked_vectors("add_coil: points", host_array("add_coil: points", points), LARGEST_POINT)
     coil = Coil(shape, radius, length, tuple(map(tuple, corners)), closed, wire_radius, ampere_turns)
     coil.check("add_coil")
-    return _add_source(builder, body, coil.record(), ampere_turns, xform, "coil", label)
+    return _add_source(builder, body, coil.record(), coil.ampere_turns, xform, "coil", label)
 
 
 @keyword_arguments("origin", "spacing", "values")
@@ -114,7 +114,7 @@ def add_field_map(
     steps = np.resize(steps, 3) if steps.ndim == 0 else steps
     field_map = FieldMap(tuple(np.atleast_1d(first)), tuple(steps), nodes, factor)
     field_map.check(name)
-    return _add_source(builder, body, field_map.record(), factor, xform, "field_map", label)
+    return _add_source(builder, body, field_map.record(), field_map.factor, xform, "field_map", label)
 
 
 def add_placed_source(
@@ -171,7 +171,7 @@ def _single_body(builder: newton.ModelBuilder, body: int | str) -> int:
 def _checked_frame(name: str, xform) -> wp.transform:
     """Return a transform from seven numbers, or from a position and a quaternion, which is normalized."""
     try:
-        parts = list(xform)
+        parts = list(plain_value(name, xform))
     except TypeError:
         parts = []
     numbers = np.concatenate([np.zeros(0), *(host_array(name, part).ravel() for part in parts)])

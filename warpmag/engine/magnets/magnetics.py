@@ -1,5 +1,6 @@
 """Magnetic forces on the bodies of a Newton model."""
 
+import warnings
 from dataclasses import replace
 
 import newton
@@ -20,7 +21,7 @@ from warpmag.engine.magnets.imported_field import imported_field
 from warpmag.engine.magnets.magnet_system import KINEMATIC, make_system
 from warpmag.engine.magnets.model_values import ModelValues, magnetic_arrays
 from warpmag.engine.magnets.sources import ModelSources
-from warpmag.errors import InputError
+from warpmag.errors import ConvergenceWarning, InputError
 from warpmag.kernels.rigid.bodies import (
     BodyMoments,
     add_wrenches,
@@ -166,6 +167,11 @@ class Magnetics:
         return self.system.converged
 
     @property
+    def is_solved(self) -> bool:
+        """True after the first :meth:`induce` or :meth:`apply`."""
+        return self._induced
+
+    @property
     def needs_velocities(self) -> bool:
         """True if forces depend on velocities, ``State.body_qd``, because a magnet conducts."""
         return self.system.eddy is not None
@@ -243,9 +249,15 @@ class Magnetics:
 
         Raises:
             InputError: ``model.warpmag`` has changed, see :meth:`notify_model_changed`; with a GPU some calls later.
+
+        Warns:
+            ConvergenceWarning: ``max_evaluations`` did not reach ``rtol``. With a GPU only methods that return arrays
+                to the host warn, because this one does not wait; see :attr:`converged`.
         """
         self.induce(state)
         self.add_forces(state)
+        if self.device.is_cpu and not self.device.is_capturing:
+            self._warn_unconverged(level=3)
 
     def induce(self, state: newton.State) -> None:
         """Solve the induction at the poses of ``state``, starting from the last magnetizations."""
@@ -444,16 +456,25 @@ class Magnetics:
 
     def _measured_probe(self, points, worlds, *, gradients: bool = False) -> FieldProbe:
         """Return a probe of the points with the present field."""
-        self._check_solved()
+        self._check_solved(level=5)
         probe = self.probe(points, worlds=worlds, gradients=gradients)
         self.check_model()
         probe.measure()
         return probe
 
-    def _check_solved(self) -> None:
-        """Raise :class:`InputError` before the first solve."""
+    def _check_solved(self, level: int = 4) -> None:
+        """Raise :class:`InputError` before the first solve, warn if the last one did not converge."""
         if not self._induced:
             raise InputError("Magnetics: there is no field yet, call apply(state) or induce(state) first")
+        self._warn_unconverged(level)
+
+    def _warn_unconverged(self, level: int) -> None:
+        """Warn if the last solve did not converge, at the caller ``level`` calls above; waits for the device."""
+        if self.converged.numpy().all():
+            return
+        error, limit = float(self.error.numpy().max()), self.system.settings.max_evaluations
+        text = f"Magnetics: did not converge, error {error:.2g} > rtol {self.rtol:g} after max_evaluations = {limit}"
+        warnings.warn(text, ConvergenceWarning, stacklevel=level)
 
     def energy(self) -> np.ndarray:
         """Return the present energy of the magnets of each world [J], shape [worlds]; 0 for a world without magnets.
@@ -473,7 +494,7 @@ class Magnetics:
         """
         self._check_solved()
         self.check_model()
-        return self.sum_moments().numpy()
+        return self.sum_moments().numpy().copy()
 
     def sum_moments(self) -> wp.array:
         """Return :meth:`shape_moments` as a Warp array, which the next call overwrites; capturable in a graph."""
@@ -481,7 +502,7 @@ class Magnetics:
         return self._shape_totals
 
     def moments_at(self, state: newton.State) -> np.ndarray:
-        """Return the total equilibrium moments at a state; later steps are not affected.
+        """Return the total equilibrium moments at a state; present fields and later steps are not affected.
 
         Args:
             state: State with poses ``body_q``.
@@ -489,12 +510,27 @@ class Magnetics:
         Returns:
             Total moment of each magnetic shape [A·m²], world frame, shape [n, 3].
         """
-        arrays = self.system.persistent_arrays()
-        saved = take_snapshot(arrays)
-        self.induce(state)
-        moments = self.shape_moments().copy()
-        restore_snapshot(arrays, saved)
-        return moments
+        self._check_state(state, "body_q")
+        system, induced = self.system, self._induced
+        persistent, fields = system.persistent_arrays(), system.field_arrays()
+        saved, saved_fields = take_snapshot(persistent), [wp.clone(array) for array in fields]
+
+        def restore():
+            restore_snapshot(persistent, saved)
+            for array, values in zip(fields, saved_fields, strict=True):
+                wp.copy(array, values)
+
+        try:
+            self.induce(state)
+            self.check_model()
+            self._warn_unconverged(level=3)
+            return self.sum_moments().numpy().copy()
+        finally:
+            restore()
+            self._induced = induced
+            if induced:
+                system.evaluate_again()
+                restore()
 
     def start_from(self, magnetizations: dict[int, np.ndarray]) -> None:
         """Set the magnetizations that the next induction starts from.

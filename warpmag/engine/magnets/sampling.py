@@ -7,7 +7,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.declarations.magnets import Magnet
+from warpmag.declarations.magnets import Magnet, check_sizes
 from warpmag.declarations.rotations import rotate
 from warpmag.engine.magnets.attributes import close_rows, unique_rows
 from warpmag.errors import InputError
@@ -93,6 +93,9 @@ class ShapeSampler:
         return self._lattices[key]
 
     def _sample(self, shapes: list[int], spacing: float, fixed: bool, permanent: bool) -> BodyLattice:
+        for shape in shapes:
+            kind = newton.GeoType(self._types[shape])
+            check_sizes(kind.name.lower(), lengths_of(kind, self._scales[shape]))
         if spacing == 0.0 and self._are_balls_apart(shapes):
             balls = [lattice.ball(self._scales[shape, 0]) for shape in shapes]
             return BodyLattice(
@@ -168,6 +171,12 @@ class ShapeSampler:
         centers, radii = self._frames[shapes, :3], self._scales[shapes, 0]
         distances = np.linalg.norm(centers[:, None] - centers, axis=2) + 3.0 * np.diag(radii)
         return bool((distances >= (radii[:, None] + radii) * (1.0 - 1e-5)).all())
+
+
+def lengths_of(kind: int, scale: Any) -> list[float]:
+    """Return the radii and half sides [m] of a Newton shape, from its type and scale; empty for a mesh."""
+    _, count = _SOLIDS.get(newton.GeoType(kind), (None, 0))
+    return [float(length) for length in scale[:count]]
 
 
 def solid_of(kind: int, scale: np.ndarray, source: Any) -> lattice.Solid:

@@ -260,8 +260,13 @@ class Simulation:
 
     @property
     def magnetics(self) -> Magnetics:
-        """The magnets at the present state; waits for the device."""
+        """The magnets at the last solve, in the last step; before the first step at the initial state.
+
+        Waits for the device. Call ``magnetics.induce(simulation.state)`` for the fields at the very present state.
+        """
         self._read_reports()
+        if not self._magnetics.is_solved:
+            self._magnetics.induce(self._stepper.state)
         return self._magnetics
 
     @property
