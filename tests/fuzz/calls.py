@@ -61,7 +61,14 @@ def new_world(balls: int = 2) -> dict[str, Any]:
         **{"magnetization": M, "magnetizations": {1: M}, "material": "iron", "time": 0.0, "frames": 1, "radius": 0.005},
         **{"origin": (0.0, 0.0, 0.0), "spacing": 0.01, "values": np.ones((3, 3, 3, 3)), "name": "iron"},
         **{"fields": [0.0, 1e3, 1e5], "flux_densities": [0.0, 1.0, 1.5], "path": os.devnull, "output": None},
-        **{"moments": np.ones((2, 3)), "radii": 0.005, "saturation": 1e6, "system": magnetics.system},
+        **{
+            "moments": np.ones((2, 3)),
+            "radii": 0.005,
+            "saturation": 1e6,
+            "device": "cpu",
+            "dtype": "float32",
+            "system": magnetics.system,
+        },
     } | {"sensor": warpmag.SensorMagnetometer(model, magnetics, "site"), "probe": FieldProbe(magnetics.system, 2)}
 
 
@@ -79,8 +86,10 @@ FUNCTIONS = (
     *("add_field_map", "material", "KeyedCurrents", "solve_induction", "h_field", "wrench"),
 )
 CURVES = ("from_bh", "from_mh", "from_csv")
-PASSIVE = {"persistent_arrays", "warnings", "frame", "allow_restart"}
-"""Methods without arguments that return no numbers."""
+USUAL = ("body", "magnetization", "saturation", "radius", "device", "dtype")
+"""Optional arguments that are given in most calls, as users do."""
+PASSIVE = {"persistent_arrays", "warnings", "frame", "allow_restart", "stay"}
+"""Methods without arguments that return no numbers, or only when a viewer is closed."""
 
 
 def new_builder(world: dict) -> newton.ModelBuilder:
@@ -172,8 +181,10 @@ class Caller:
         function = targets()[self.name](self.world)
         names = [one for one in inspect.signature(function).parameters if one not in ("args", "options", "overlays")]
         parameters = inspect.signature(function).parameters
-        arguments = {one: self.world[one] for one in names if parameters[one].default is inspect.Parameter.empty}
-        for one in chance.sample(names, min(len(names), chance.randint(1, 3))):
+        needed = [one for one in names if parameters[one].default is inspect.Parameter.empty]
+        needed += [one for one in names if one in USUAL and one not in needed and chance.random() < 0.8]
+        arguments = {one: self.world[one] for one in needed}
+        for one in chance.sample(names, min(len(names), chance.choice((0, 1, 1, 1, 2, 3)))):
             arguments[one] = wild(chance, self.world)
         outcome = Outcome(number, f"{self.name}({', '.join(f'{k}={_short(v)}' for k, v in arguments.items())})")
         announce(outcome.call)

@@ -17,6 +17,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
+from warpmag.declarations.checks import plain_value, short_repr
 from warpmag.errors import InputError
 
 MU0 = 1.2566370614359173e-06
@@ -101,7 +102,9 @@ class MagnetizationCurve:
         Raises:
             InputError: The file cannot be read, or the points are no magnetization curve.
         """
-        name = os.path.basename(os.fspath(path))
+        if not isinstance(path, str | os.PathLike):
+            raise InputError(f"path: must be the name of a file, got {short_repr(path)}")
+        name = os.path.basename(os.fspath(path)) or "path"
         (_, h_unit), (quantity, second_unit), rows = _read_csv(path, name)
         h, second = rows[:, 0] * h_unit, rows[:, 1] * second_unit
         if quantity == "m":
@@ -116,8 +119,7 @@ class MagnetizationCurve:
         _check_points(name, h, m)
         m = np.maximum.accumulate(m)
         slope = float(_slopes(h, m)[-1])
-        if saturation is None:
-            saturation = float(m[-1] + h[-1] * slope)
+        saturation = float(m[-1] + h[-1] * slope) if saturation is None else plain_value(name, saturation)
         _check_saturation(name, h, m, slope, saturation)
         return cls(tuple(h.tolist()), tuple(m.tolist()), float(saturation), name)
 
@@ -243,7 +245,7 @@ def _read_csv(path, name: str):
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             lines = [row for row in csv.reader(line for line in file if line.strip() and line.lstrip()[0] != "#")]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, ValueError, csv.Error) as error:  # text in another encoding, or a name with a null character
         raise InputError(f"{name}: cannot be read ({error})") from None
     matches = [_COLUMN.fullmatch(cell) for cell in lines[0]] if lines else []
     if len(matches) != 2 or None in matches:

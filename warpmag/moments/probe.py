@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warpmag.declarations.checks import check_whole, short_repr
+from warpmag.declarations.checks import check_flag, check_whole, short_repr
 from warpmag.errors import InputError
 from warpmag.kernels.applied.fields import AppliedField
 from warpmag.kernels.pairs.evaluate import PairEvaluation
@@ -50,6 +50,9 @@ class FieldProbe:
     ):
         """Allocate all buffers."""
         self._system = system
+        if not isinstance(system, MomentSystem):
+            raise InputError(f"system: must be a MomentSystem, got {short_repr(system)}")
+        check_flag("gradients", gradients)
         ranges = system.world_ranges
         check_whole("count", count)
         if not 0 <= count < 2**31:

@@ -4,6 +4,7 @@ import os
 import re
 from pathlib import Path
 
+from warpmag.declarations.checks import short_repr
 from warpmag.errors import InputError
 
 _ARGUMENTS = ":SDF_FORMAT_ARGS:"
@@ -13,6 +14,8 @@ _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 def usable_path(path: str | os.PathLike) -> Path:
     """Return a path, ``~`` expanded; raise :class:`InputError` if USD cannot name it in a layer or in a message."""
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"path: must be the name of a file, got {short_repr(path)}")
     text = os.fsdecode(path)
     if not text:
         raise InputError("the path of a file must not be empty")

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warpmag.declarations import materials
-from warpmag.declarations.checks import check_not_negative, check_positive, check_vector
+from warpmag.declarations.checks import check_not_negative, check_positive, check_vector, real_number
 from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.likely_units import warn_of_magnetization, warn_of_radius
 from warpmag.declarations.magnets import Magnet
@@ -211,7 +211,7 @@ def _magnet(material, response: dict, magnetization, recoil_permeability: float)
     """Return the magnet that :func:`add_balls` describes; ``response`` has the arguments of inducible magnets."""
     fields = {name: value for name, value in response.items() if value is not None}
     if magnetization is None:
-        if recoil_permeability != 1.0:
+        if real_number("recoil_permeability", recoil_permeability) != 1.0:
             raise InputError("recoil_permeability: for permanent magnets only, which need a magnetization")
         curve = fields.pop("curve", None)
         return Magnet("inducible", **materials.inducible_from(material, curve, fields))

@@ -379,6 +379,9 @@ class Magnetics:
             magnetization = host_array("magnetization", magnetization)
             if magnetization.shape == (3,):
                 check_magnetization("magnetization", magnetization)
+        check_whole("body", body)
+        if shape is not None:
+            check_whole("shape", shape)
         selected = self._permanent_bodies == body if shape is None else self._permanent_shapes == shape
         rows = np.flatnonzero(selected)
         if not len(rows) or (shape is None and body < 0):
@@ -430,11 +433,10 @@ class Magnetics:
             if len(self._worlds) > 1:
                 raise InputError(f"worlds: must be given, {len(self._worlds)} worlds hold magnets")
             return np.zeros(count, int)
-        worlds = np.asarray(worlds)
-        if worlds.dtype.kind not in "iu" or worlds.shape not in ((), (count,)):
-            raise InputError(
-                f"worlds: must be whole numbers, one or {count}, got {worlds.dtype} of {list(worlds.shape)}"
-            )
+        numbers = host_array("worlds", worlds)
+        worlds = numbers.astype(int) if (np.abs(numbers) < 2**31).all() else np.full(numbers.shape, -1)
+        if (worlds != numbers).any() or worlds.shape not in ((), (count,)):
+            raise InputError(f"worlds: must be whole numbers, one or {count}, got {short_repr(numbers.tolist())}")
         unknown = worlds[~np.isin(worlds, self._worlds)]
         if unknown.size:
             raise InputError(f"worlds: world {unknown.flat[0]} holds no magnets")

@@ -373,11 +373,15 @@ class Simulation:
             SimulationError: A step led to a state that is not finite.
         """
         frames = self.frames_of(frames)
+        for name, flag in (("copy_scene", copy_scene), ("resume", resume)):
+            check_flag(name, flag)
+        if on_frame is not None and not callable(on_frame):
+            raise InputError(f"on_frame: must be a function, got {short_repr(on_frame)}")
         recorder = None if output is None else self._open_recorder(output, copy_scene, frames)
         if resume and (recorder is None or self._scene is None):
             raise InputError("resume: needs an output, and a scene from a stage")
         if resume and self._stepper.steps:
-            raise ValueError("only a simulation that has not begun can resume another")
+            raise InputError("resume: only a simulation that has not begun can resume another")
         if resume and not SOLVERS[self._options["solver"]].resumable:
             raise InputError(f"resume: runs of the solver {self._options['solver']} cannot be resumed")
         resumed = complete = False

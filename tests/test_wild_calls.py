@@ -1,0 +1,48 @@
+"""Wild calls of every public function of builders, models, states and arrays, in child processes: a crash counts.
+
+Ten of each by default; as many as wanted with ``python -m tests.fuzz.calls``.
+"""
+
+import os
+import signal
+
+import pytest
+from fuzz import calls
+
+pytestmark = pytest.mark.no_cover  # what is drawn decides no line of the report
+HEAVY = ("Simulation", "Display")
+"""Owners whose construction takes long: a third of the calls."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def kernels():
+    """Compiled before the first fork."""
+    calls.new_world()
+
+
+@pytest.mark.parametrize("owner", [*calls.OWNERS, "functions"])
+def test_wild_calls_are_refused_or_finite(owner, device):
+    if device != "cpu":
+        pytest.skip("a GPU does not survive a fork")
+    names = [name for name in calls.targets() if (name.partition(".")[0] in calls.OWNERS) == (owner != "functions")]
+    names = [name for name in names if owner in ("functions", name.partition(".")[0])]
+    count = 3 if owner in HEAVY else 10
+    results = [outcome for name in names for outcome in calls.outcomes(name, 7, list(range(count)))]
+    assert [(one.number, one.call, one.problem) for one in results if one.problem] == []
+    assert len(results) == count * len(names) and any(one.taken for one in results)
+
+
+def test_a_crash_is_seen(monkeypatch):
+    """The call that ended its process is named, and those after it are made."""
+
+    def call(self, number, announce):
+        announce(f"call {number}")
+        if number == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return calls.Outcome(number, f"call {number}", taken=True)
+
+    monkeypatch.setattr(calls.Caller, "call", call)
+    results = {one.number: one for one in calls.outcomes("wrench", 0, list(range(4)))}
+    assert sorted(results) == [0, 1, 2, 3]
+    assert results[2].call == "call 2" and results[2].problem == f"its process ended with the status {signal.SIGKILL:d}"
+    assert not any(results[number].problem for number in (0, 1, 3))
