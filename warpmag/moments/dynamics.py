@@ -115,4 +115,4 @@ def make_dynamics(name: str, state, *, responses=None, step: float | None = None
     step, damping = STEP if step is None else step, DAMPING if damping is None else damping
     check_positive("step", step)
     check_positive("damping", damping)
-    return SubmagnetizationPairs(state, name, step, damping)
+    return SubmagnetizationPairs(state, name, float(step), float(damping))

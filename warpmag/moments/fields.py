@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpmag.declarations.checks import check_not_negative, check_token
+from warpmag.declarations.checks import check_not_negative, check_token, real_number
 from warpmag.declarations.magnets import check_rtol
 from warpmag.errors import InputError
 from warpmag.kernels.pairs.packing import PackedMoments
@@ -81,6 +81,7 @@ def h_field(
         159.2
     """
     context = resolve_context(positions, dtype, device)
+    smoothing, rtol = real_number("smoothing", smoothing), None if rtol is None else real_number("rtol", rtol)
     reference = _is_reference(context, method, smoothing, radii, rtol, dtype)
     same_set = targets is None
     if same_set and target_radii is not None:
@@ -148,6 +149,7 @@ def wrench(
         0.006
     """
     context = resolve_context(positions, dtype, device)
+    smoothing, rtol = real_number("smoothing", smoothing), None if rtol is None else real_number("rtol", rtol)
     reference = _is_reference(context, method, smoothing, radii, rtol, dtype)
     size = _largest_radius("radii", radii, context.dtype, reference)
     farthest = largest_coordinate(context.dtype, 2.0 * size, reference=reference)

@@ -132,7 +132,7 @@ class Magnetics:
         )
         self._sources.bind(self.system)
         self._map_bodies()
-        set_conductivities(model, self.magnets, self.system, dt)
+        set_conductivities(model, self.magnets, self.system, float(dt))
         if imported is not None:
             self.set_external_field(imported)
 
