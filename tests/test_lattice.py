@@ -176,6 +176,13 @@ def test_concave_mesh():
     assert not notch.any()
 
 
+def test_a_mesh_that_is_asked_about_no_point():
+    """As a part of a body whose other parts are elsewhere: it raised an error of NumPy."""
+    solid = lattice.mesh(*box_mesh((0.01, 0.01, 0.01)))
+    assert not solid.contains(np.full((5, 3), 1.0)).any()
+    assert solid.contains(np.zeros((0, 3))).shape == (0,)
+
+
 def test_facets_leave_out_triangles_without_area():
     """Polygons with a straight corner have such triangles, which have no normal."""
     outline = np.array([[0, 0], [1, 0], [3, 0], [3, 2], [0, 2]]) * 0.01
