@@ -13,6 +13,7 @@ from small_builders import add_ball, new_builder
 import warpmag
 from warpmag.declarations.magnets import Magnet
 from warpmag.engine.magnets.attributes import stored_values
+from warpmag.moments.probe import FieldProbe
 
 M = (0.0, 0.0, 1e6)
 POINTS = [(0.0, 0.0, 0.01), (0.02, 0.01, 0.0)]
@@ -216,6 +217,11 @@ def test_sizes_of_magnetic_shapes(shape, size):
     for add in (warpmag.add_inducible, lambda *a, **k: warpmag.add_permanent(*a, magnetization=M, **k)):
         with pytest.raises(warpmag.InputError, match=r"^shape_0: sizes must be from 1e-08 to 20000 m, got "):
             add(builder, body=body)
+
+
+def test_a_probe_of_as_many_points_as_numpy_counts(device):
+    system = warpmag.Magnetics(pair(device).finalize(device=device)).system
+    assert FieldProbe(system, np.int64(3)).points.shape == (3,)
 
 
 def test_equal_curves_share_a_number():

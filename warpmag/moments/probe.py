@@ -57,6 +57,7 @@ class FieldProbe:
         check_whole("count", count)
         if not 0 <= count < 2**31:
             raise InputError(f"count: must be at least 0 and below 2³¹, got {short_repr(count)}")
+        count = int(count)  # Warp takes no whole numbers of NumPy
         numbers = host_array("worlds", np.zeros(count) if worlds is None else worlds)
         if numbers.shape != (count,):
             raise InputError(shape_message("worlds", f"[{count}]", numbers))
