@@ -4,6 +4,7 @@ import contextlib
 import os
 import signal
 import threading
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.engine.stepping.scene import ImportedScene
 from warpmag.engine.stepping.statistics import Statistics
 from warpmag.engine.stepping.stepper import Stepper
-from warpmag.errors import InputError
+from warpmag.errors import ConvergenceWarning, InputError
 from warpmag.moments.ranks import Ranks, errors_on_all_ranks, is_first_rank, on_first_rank
 from warpmag.usd import CacheWriter
 
@@ -104,7 +105,9 @@ class Recorder:
         if time > 0.0:
             self._magnetics.sum_moments()
         else:
-            self._magnetics.moments_at(state)
+            with warnings.catch_warnings():  # the statistics count substeps that did not converge
+                warnings.simplefilter("ignore", ConvergenceWarning)
+                self._magnetics.moments_at(state)
         self._host_copies.copy()
         due = self._writer.save_due
         checkpoint = None
