@@ -61,8 +61,38 @@ template <class Arrays> CUDA_CALLABLE inline Cell cell_at(const Arrays& arrays, 
 CUDA_CALLABLE inline SourceFade cell_fade(const Cell& cell, const PermanentBody& body) {
     return fade_of(cell.center, cell.size, CELL_REACH_LOW, CELL_REACH_HIGH, body.frame, body.box_center, body.box_half);
 }
-CUDA_CALLABLE inline Number potential_of(const PermanentBody& body, Vector local) {
-    return dot(broadcast(body.m), potentials_of(body.solid, local));
+// Points in the frame of a permanent body, and the face of the body that they have passed: the charge of that face, if
+// they are inside, and their height above it. Points on the face count as outside.
+struct NearPoints {
+    Vector at, normal;
+    Number charge, height;
+};
+CUDA_CALLABLE inline NearPoints near_points(const PermanentBody& body, Vector x) {
+    const Number zero = Number(Real(0)), touching = zero + Real(1e-6) * body.radius;
+    NearPoints points = {body.frame.point_to_body(x), {zero, zero, zero}, zero, zero - 2 * body.radius};
+    for (int f = 0; f < body.solid.faces; ++f) {
+        const Vector n = broadcast(real3(body.solid.face + FACE_ROW * f));
+        const Vector corner = broadcast(real3(body.solid.corner + 3 * body.solid.begin[f]));
+        const Number height = dot(points.at - corner, n);
+        const Mask nearer = height > points.height;
+        points.height = nearer ? height : points.height;
+        points.normal.x = nearer ? n.x : points.normal.x, points.normal.y = nearer ? n.y : points.normal.y;
+        points.normal.z = nearer ? n.z : points.normal.z;
+    }
+    const Number shift = points.height * points.height < touching * touching ? 2 * touching : zero;
+    points.at += shift * points.normal;
+    points.height += shift;
+    points.charge = points.height < 0 ? dot(broadcast(body.m), points.normal) : zero;
+    return points;
+}
+// Potential and field of a body. Where contacts let an iron face sink into a magnet they are those of the outside, as
+// if the magnet's face were in front of the points: the pull does not turn into a push.
+CUDA_CALLABLE inline Number potential_of(const PermanentBody& body, const NearPoints& points) {
+    return dot(broadcast(body.m), potentials_of(body.solid, points.at)) - points.charge * points.height;
+}
+CUDA_CALLABLE inline Vector field_outside(const PermanentBody& body, const NearPoints& points) {
+    const Vector h = field_of(body.solid, body.m, points.at, Number(Real(0)), 0, 1).h;
+    return body.frame.to_world(h + points.charge * points.normal);
 }
 CUDA_CALLABLE inline Real3 first_lane(Vector v) { return {lane_of(v.x, 0), lane_of(v.y, 0), lane_of(v.z, 0)}; }
 // Closed form of a body's field at the center of a cell, in all lanes.
@@ -89,7 +119,7 @@ template <class Arrays> CUDA_CALLABLE inline void average_over_cell(const Arrays
         Vector sums = zero_target_field().h; // along the axes of the grid
         for (int k = WIDTH * share(); k < CELL_POINTS; k += WIDTH * SHARES) {
             const int face = k / FACE_POINTS;
-            const Number phi = potential_of(body, body.frame.point_to_body(cell.points(units, k)));
+            const Number phi = potential_of(body, near_points(body, cell.points(units, k)));
             (face < 2 ? sums.x : face < 4 ? sums.y : sums.z) += (face % 2 ? -1 : 1) * cell.share_of(face) * phi;
             if (acts) put(potential + k, (is_near ? numbers(potential + k) : 0 * phi) + fade.weight * phi);
         }
@@ -131,13 +161,14 @@ CUDA_CALLABLE inline void add_cell_wrench(const Arrays& arrays, const Cell& cell
     Wrench wrench = zero_wrench();
     for (int k = WIDTH * share(); k < CELL_POINTS; k += WIDTH * SHARES) {
         const int face = k / FACE_POINTS;
-        const Vector x = cell.points(arrays.cells.point.data, k), local = body.frame.point_to_body(x);
+        const Vector x = cell.points(arrays.cells.point.data, k);
+        const NearPoints points = near_points(body, x);
         Number charge = zero + (face % 2 ? 1 : -1) * cell.share_of(face) * dot(m, cell.axes[face / 2]);
         if (cell.is_outer(face)) charge += response_charges(cell, potential, k);
-        const Vector f = charge * body.frame.to_world(field_of(body.solid, body.m, local, zero, 0, 1).h);
+        const Vector f = charge * field_outside(body, points);
         wrench.force += f;
         wrench.torque += cross(x - broadcast(cell.center), f);
-        wrench.energy += charge * potential_of(body, local);
+        wrench.energy += charge * potential_of(body, points);
     }
     const TargetField at_center = center_field(cell, body);
     const Real3 h = first_lane(at_center.h), f = first_lane(gradient_dot(at_center, broadcast(m)));
