@@ -16,9 +16,11 @@ from the same fields, so that forces are opposite and equal. Without sources non
 | sources | records of sources, and the arrays of sources and targets on a device |
 | fields | launches: fields at targets and about balls, forces, reactions |
 | solids | tables of permanent bodies and of the polyhedra that bound them |
+| near_cells | cells near permanent bodies: averages of the field, charges on their faces |
 | expansion | points and tables for the expansion of a field about a ball |
 | `passes.h` | passes over targets and sources |
 | `target_field.h` | field and gradient at a vector of targets, and the force on moments there |
+| `near_cells.h` | average fields over cells, charges on faces, their forces |
 | `rates.h` | rate of change of a field at moving targets |
 | `balls.h` | expansion of fields about balls |
 | `sources.h` | kinds of coils and maps, and their frames |
