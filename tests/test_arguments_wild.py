@@ -237,7 +237,7 @@ def test_any_magnetics(magnets, data):
 @given(st.data())
 def test_any_simulation(device, data):
     """What is taken makes a step, after which the ball is somewhere."""
-    names = SETTINGS.replace("max_evaluations ", "") + " step solver device graphs visuals scene"
+    names = SETTINGS.replace("max_evaluations ", "") + " dt solver device graphs visuals scene"
     builder = two_shapes()
     warpmag.add_inducible(builder, body=0)
     with refusals(), contextlib.suppress(warpmag.SimulationError):

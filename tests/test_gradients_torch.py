@@ -25,8 +25,10 @@ def gradcheck(function, arguments):
 def test_field(device):
     x, m, targets = tensors(device, (4, 3), (4, 3), (3, 3))
     field = warpmag.torch.h_field(x, m, targets, radii=0.1)
-    expected = warpmag.h_field(x.detach().numpy(), m.detach().numpy(), targets.detach().numpy(), dtype="float64")
-    assert np.allclose(field.detach().numpy(), expected, rtol=1e-12, atol=0.0)
+    expected = warpmag.h_field(
+        x.detach().cpu().numpy(), m.detach().cpu().numpy(), targets.detach().cpu().numpy(), dtype="float64"
+    )
+    assert np.allclose(field.detach().cpu().numpy(), expected, rtol=1e-12, atol=0.0)
     assert gradcheck(warpmag.torch.h_field, (x, m, targets))
 
 
@@ -42,9 +44,11 @@ def test_wrench(device):
 
 def test_equilibrium(device):
     (noise, field, dipoles, dipole_moments) = tensors(device, (4, 3), (1, 3), (2, 3), (2, 3), scale=0.1)
-    lattice = torch.tensor(np.stack(np.meshgrid([0, 1], [0, 1], [0]), -1).reshape(-1, 3), dtype=torch.float64)
-    radii = torch.tensor([0.3, 0.25, 0.3, 0.35], dtype=torch.float64, requires_grad=True)
-    saturation, susceptibility = (torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (2.0, 30.0))
+    lattice = torch.tensor(np.stack(np.meshgrid([0, 1], [0, 1], [0]), -1).reshape(-1, 3)).to(noise)
+    radii = torch.tensor([0.3, 0.25, 0.3, 0.35], dtype=torch.float64, device=noise.device, requires_grad=True)
+    saturation, susceptibility = (
+        torch.tensor(v, dtype=torch.float64, device=noise.device, requires_grad=True) for v in (2.0, 30.0)
+    )
 
     def solve(noise, radii, saturation, susceptibility, field, dipoles, dipole_moments):
         result = warpmag.torch.solve_induction(
@@ -56,14 +60,14 @@ def test_equilibrium(device):
     arguments = (noise, radii, saturation, susceptibility, field, dipoles, dipole_moments)
     assert gradcheck(solve, arguments)
     result = warpmag.solve_induction(
-        (lattice + noise).detach().numpy(), radii.detach().numpy(), saturation=2.0, susceptibility=30.0,
-        external_field=20.0 * field[0].detach().numpy(), rtol=1e-12, dtype="float64",
-        permanent=((dipoles + 2.0).detach().numpy(), dipole_moments.detach().numpy()),
+        (lattice + noise).detach().cpu().numpy(), radii.detach().cpu().numpy(), saturation=2.0, susceptibility=30.0,
+        external_field=20.0 * field[0].detach().cpu().numpy(), rtol=1e-12, dtype="float64",
+        permanent=((dipoles + 2.0).detach().cpu().numpy(), dipole_moments.detach().cpu().numpy()),
     )  # fmt: skip
     for value, expected in zip(
         solve(*arguments), (result.magnetizations, result.h_field, 1e6 * result.wrench()[0]), strict=True
     ):
-        assert np.allclose(value.detach().numpy(), expected, rtol=1e-9, atol=1e-9)
+        assert np.allclose(value.detach().cpu().numpy(), expected, rtol=1e-9, atol=1e-9)
 
 
 def test_measured_curves_and_precision(device):

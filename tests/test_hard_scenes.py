@@ -68,7 +68,7 @@ def test_steps_of_any_length(step, device):
     builder = new_builder()
     add_pile(builder)
     add_ball(builder, (2.0 * R, 2.0 * R, 0.05), magnetization=(0.0, 0.0, 1e6), radius=0.01, is_kinematic=True)
-    simulation = run(builder, device, 5.0 * step, step=step)
+    simulation = run(builder, device, 5.0 * step, dt=step)
     assert simulation.time == pytest.approx(5.0 * step)
     assert simulation.statistics.overlap < 0.05 and spread(simulation) < 0.1
 

@@ -131,6 +131,8 @@ template <class Arrays> CUDA_CALLABLE inline void average_over_cell(const Arrays
     }
     if (share() != 0) return;
     arrays.cells.near.data[c] = is_near;
+    Real* const at_change = (Real*)arrays.cells.change.data + 3 * (size_t)c;
+    at_change[0] = acting.x, at_change[1] = acting.y, at_change[2] = acting.z;
     Real* const at_field = (Real*)arrays.targets.field.data + 3 * (size_t)cell.moment;
     Real* const at_acting = (Real*)arrays.targets.acting.data + 3 * (size_t)cell.moment;
     at_field[0] += field.x, at_field[1] += field.y, at_field[2] += field.z;
@@ -147,6 +149,9 @@ CUDA_CALLABLE inline Number response_charges(const Cell& cell, const Real* poten
     return cell.response * charge;
 }
 
+CUDA_CALLABLE inline Real3 effective_at(const Real* effective, size_t pitch, int i) {
+    return {effective[i], effective[pitch + i], effective[2 * pitch + i]};
+}
 // Adds force/μ0 and torque/μ0 about the center of cell c by a body, less those of its field at the center.
 template <class Arrays>
 CUDA_CALLABLE inline void add_cell_wrench(const Arrays& arrays, const Cell& cell, int c, const PermanentBody& body,
@@ -154,8 +159,7 @@ CUDA_CALLABLE inline void add_cell_wrench(const Arrays& arrays, const Cell& cell
     const SourceFade fade = cell_fade(cell, body);
     if (fade.weight == 0 || body.label == cell.label) return;
     const size_t pitch = arrays.effective.strides[0] / sizeof(Real);
-    const Real* const column = arrays.effective.data + cell.moment;
-    const Real3 m = {column[0], column[pitch], column[2 * pitch]};
+    const Real3 m = effective_at(arrays.effective.data, pitch, cell.moment);
     const Real* const potential = arrays.cells.potential.data + CELL_POINTS * (size_t)c;
     const Number zero = Number(Real(0));
     Wrench wrench = zero_wrench();
@@ -177,11 +181,14 @@ CUDA_CALLABLE inline void add_cell_wrench(const Arrays& arrays, const Cell& cell
     torque += fade.weight * (total_of(wrench.torque) - cross(m, h));
 }
 
-// Adds force and torque of near bodies on cell c.
+// Adds force and torque of near bodies on cell c. The torque m × H of its moment contains the averages already.
 template <class Arrays> CUDA_CALLABLE inline void act_on_cell(const Arrays& arrays, int c) {
     const Cell cell = cell_at(arrays, c);
     if (!arrays.cells.near.data[c] || !arrays.cells.movable.data[cell.moment]) return;
-    Real3 force = {0, 0, 0}, torque = force;
+    const size_t pitch = arrays.effective.strides[0] / sizeof(Real);
+    const Real3 m = effective_at(arrays.effective.data, pitch, cell.moment);
+    const Real3 change = real3((const Real*)arrays.cells.change.data + 3 * (size_t)c);
+    Real3 force = {0, 0, 0}, torque = cross(change, m);
     for (int b = cell.first; b < cell.last; ++b) add_cell_wrench(arrays, cell, c, body_at(arrays, b), force, torque);
     if (share() != 0) return;
     Real* const on = (Real*)arrays.cells.forces.data + 3 * (size_t)cell.moment;

@@ -48,6 +48,7 @@ def cell_arrays_type(dtype):
         forces: wp.array[vec3]  # [N], added to
         torques: wp.array[vec3]  # about the moments' positions [N·m], added to
         # Data out:
+        change: wp.array[vec3]  # change of the field that exerts torques by the averages [A/m], shape [cells]
         near: wp.array[int]  # 1 for cells near a body that acts on them, shape [cells]
         potential: wp.array[dtype]  # potential of these bodies at the points, faded [A], shape [cells, 6 FACE_POINTS]
 
@@ -111,6 +112,7 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solid_rang
     arrays.response = put(np.concatenate([matrices.ravel() for _, matrices in tables.values()]), dtype)
     arrays.movable = put(movable)
     arrays.near = wp.zeros(len(order), dtype=wp.int32, device=device)
+    arrays.change = wp.zeros(len(order), dtype=wp.types.vector(3, dtype), device=device)
     arrays.potential = wp.zeros(len(order) * 6 * FACE_POINTS, dtype=dtype, device=device)
 
 
