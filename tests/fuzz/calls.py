@@ -179,13 +179,13 @@ class Caller:
         """Make one call, and a right one after it; return what became of it."""
         chance = random.Random(f"{self.seed}-{self.name}-{number}")
         function = targets()[self.name](self.world)
-        names = [one for one in inspect.signature(function).parameters if one not in ("args", "options", "overlays")]
+        names = [name for name in inspect.signature(function).parameters if name not in ("args", "options", "overlays")]
         parameters = inspect.signature(function).parameters
-        needed = [one for one in names if parameters[one].default is inspect.Parameter.empty]
-        needed += [one for one in names if one in USUAL and one not in needed and chance.random() < 0.8]
-        arguments = {one: self.world[one] for one in needed}
-        for one in chance.sample(names, min(len(names), chance.choice((0, 1, 1, 1, 2, 3)))):
-            arguments[one] = wild(chance, self.world)
+        needed = [name for name in names if parameters[name].default is inspect.Parameter.empty]
+        needed += [name for name in names if name in USUAL and name not in needed and chance.random() < 0.8]
+        arguments = {name: self.world[name] for name in needed}
+        for name in chance.sample(names, min(len(names), chance.choice((0, 1, 1, 1, 2, 3)))):
+            arguments[name] = wild(chance, self.world)
         outcome = Outcome(number, f"{self.name}({', '.join(f'{k}={_short(v)}' for k, v in arguments.items())})")
         announce(outcome.call)
         try:
@@ -221,16 +221,16 @@ class Caller:
 
 def _raised_by(error: BaseException, arguments: dict) -> bool:
     """Return True for the error of a function that was an argument."""
-    code = [one.__code__ for one in arguments.values() if inspect.isfunction(one)]
+    code = [value.__code__ for value in arguments.values() if inspect.isfunction(value)]
     return any(frame.f_code in code for frame, _ in traceback.walk_tb(error.__traceback__))
 
 
 def _numbers(result: Any) -> Iterator[np.ndarray]:
-    for one in result if isinstance(result, tuple | list) else [result]:
-        if isinstance(one, wp.array) and one.dtype in (wp.float32, wp.vec3):
-            yield one.numpy()
-        elif isinstance(one, np.ndarray | float):
-            yield np.asarray(one)
+    for part in result if isinstance(result, tuple | list) else [result]:
+        if isinstance(part, wp.array) and part.dtype in (wp.float32, wp.vec3):
+            yield part.numpy()
+        elif isinstance(part, np.ndarray | float):
+            yield np.asarray(part)
 
 
 def _short(value: Any) -> str:
@@ -296,13 +296,13 @@ def main() -> int:
     options = parser.parse_args()
     new_world()  # kernels are compiled before the first fork
     total = 0
-    for name in (one for one in targets() if options.only in one and options.without not in one):
+    for name in (target for target in targets() if options.only in target and options.without not in target):
         results = list(outcomes(name, options.seed, list(range(options.count))))
-        bad = [one for one in results if one.problem]
+        bad = [outcome for outcome in results if outcome.problem]
         total += len(bad)
-        print(f"{name:40} {sum(one.taken for one in results):6} taken {len(bad):6} problems", flush=True)
-        for one in bad[:5]:
-            print(f"    {one.number}: {one.call[:300]}\n        {one.problem}", flush=True)
+        print(f"{name:40} {sum(outcome.taken for outcome in results):6} taken {len(bad):6} problems", flush=True)
+        for outcome in bad[:5]:
+            print(f"    {outcome.number}: {outcome.call[:300]}\n        {outcome.problem}", flush=True)
     print(f"{total} problems")
     return 1 if total else 0
 
