@@ -87,12 +87,10 @@ CUDA_CALLABLE inline NearPoints near_points(const PermanentBody& body, Vector x)
 }
 // Potential and field of a body. Where contacts let an iron face sink into a magnet they are those of the outside, as
 // if the magnet's face were in front of the points: the pull does not turn into a push.
-CUDA_CALLABLE inline Number potential_of(const PermanentBody& body, const NearPoints& points) {
-    return dot(broadcast(body.m), potentials_of(body.solid, points.at)) - points.charge * points.height;
-}
-CUDA_CALLABLE inline Vector field_outside(const PermanentBody& body, const NearPoints& points) {
-    const Vector h = field_of(body.solid, body.m, points.at, Number(Real(0)), 0, 1).h;
-    return body.frame.to_world(h + points.charge * points.normal);
+CUDA_CALLABLE inline PotentialField outer_field(const PermanentBody& body, Vector x) {
+    const NearPoints points = near_points(body, x);
+    const PotentialField f = potential_field_of(body.solid, body.m, points.at);
+    return {f.phi - points.charge * points.height, body.frame.to_world(f.h + points.charge * points.normal)};
 }
 CUDA_CALLABLE inline Real3 first_lane(Vector v) { return {lane_of(v.x, 0), lane_of(v.y, 0), lane_of(v.z, 0)}; }
 // Closed form of a body's field at the center of a cell, in all lanes.
@@ -119,7 +117,7 @@ template <class Arrays> CUDA_CALLABLE inline void average_over_cell(const Arrays
         Vector sums = zero_target_field().h; // along the axes of the grid
         for (int k = WIDTH * share(); k < CELL_POINTS; k += WIDTH * SHARES) {
             const int face = k / FACE_POINTS;
-            const Number phi = potential_of(body, near_points(body, cell.points(units, k)));
+            const Number phi = outer_field(body, cell.points(units, k)).phi;
             (face < 2 ? sums.x : face < 4 ? sums.y : sums.z) += (face % 2 ? -1 : 1) * cell.share_of(face) * phi;
             if (acts) put(potential + k, (is_near ? numbers(potential + k) : 0 * phi) + fade.weight * phi);
         }
@@ -166,13 +164,13 @@ CUDA_CALLABLE inline void add_cell_wrench(const Arrays& arrays, const Cell& cell
     for (int k = WIDTH * share(); k < CELL_POINTS; k += WIDTH * SHARES) {
         const int face = k / FACE_POINTS;
         const Vector x = cell.points(arrays.cells.point.data, k);
-        const NearPoints points = near_points(body, x);
+        const PotentialField at_points = outer_field(body, x);
         Number charge = zero + (face % 2 ? 1 : -1) * cell.share_of(face) * dot(m, cell.axes[face / 2]);
         if (cell.is_outer(face)) charge += response_charges(cell, potential, k);
-        const Vector f = charge * field_outside(body, points);
+        const Vector f = charge * at_points.h;
         wrench.force += f;
         wrench.torque += cross(x - broadcast(cell.center), f);
-        wrench.energy += charge * potential_of(body, points);
+        wrench.energy += charge * at_points.phi;
     }
     const TargetField at_center = center_field(cell, body);
     const Real3 h = first_lane(at_center.h), f = first_lane(gradient_dot(at_center, broadcast(m)));

@@ -145,6 +145,36 @@ CUDA_CALLABLE inline CurlFreeField field_of(const Solid& solid, Real3 m, Vector 
     return out;
 }
 
+// Scalar potential and field of magnetization m at x, in the frame of the solid.
+struct PotentialField {
+    Number phi;
+    Vector h;
+};
+CUDA_CALLABLE inline PotentialField potential_field_of(const Solid& solid, Real3 m, Vector x) {
+    constexpr Real INVERSE = Real(0.07957747154594767); // 1/4π
+    const Number zero = Number(Real(0));
+    PotentialField out = {zero, {zero, zero, zero}};
+    const Real negligible = Real(1e-12) * dot(m, m);
+    for (int e = 0; e < solid.edges; ++e) {
+        const Real* const edge = solid.edge + EDGE_ROW * e;
+        const Real s1 = INVERSE * dot(m, real3(edge + 13)), s2 = INVERSE * dot(m, real3(edge + 16));
+        if (s1 * s1 + s2 * s2 <= negligible) continue;
+        const EdgeView at = view_edge(edge, x, zero);
+        const Vector w = logarithm(at.sum / at.difference) * broadcast(s1 * real3(edge + 7) + s2 * real3(edge + 10));
+        out.h += w;
+        out.phi += dot(at.a, w);
+    }
+    for (int f = 0; f < solid.faces; ++f) {
+        const Real3 n = real3(solid.face + FACE_ROW * f);
+        const Real charge = -2 * INVERSE * dot(m, n);
+        if (charge * charge <= negligible) continue;
+        const Number angle = charge * half_solid_angle(solid, f, x);
+        out.h += angle * broadcast(n);
+        out.phi -= angle * dot(x - broadcast(real3(solid.corner + 3 * solid.begin[f])), broadcast(n));
+    }
+    return out;
+}
+
 // G = Σ n P at x, in the frame of the solid.
 CUDA_CALLABLE inline Vector potentials_of(const Solid& solid, Vector x) {
     const Number zero = Number(Real(0));
