@@ -1,4 +1,4 @@
-"""What a program that nobody tuned to does: asks early, asks twice, passes other libraries' arrays, stops too soon."""
+"""Programs of hurried users: they ask early or twice, pass other libraries' arrays, and stop too soon."""
 
 import copy
 import math
@@ -144,7 +144,7 @@ def test_results_can_be_pickled_and_copied(device):
 
 
 class Tensor:
-    """What warpmag needs of a tensor of PyTorch: ``numpy()`` that fails where a GPU or a gradient holds the numbers."""
+    """Stand-in for a tensor of PyTorch: ``numpy()`` fails where a GPU or a gradient holds the numbers."""
 
     def __init__(self, values, readable=True):
         self._values, self._readable = np.asarray(values), readable

@@ -466,7 +466,7 @@ def test_a_foreign_checkpoint_is_refused_and_nothing_written(kind, scene, tmp_pa
 
 
 def test_damaged_references_are_repaired_and_values_recognized(scene, tmp_path, device, always, capsys):
-    """Where a frame's values stand is known without the file; the values themselves have a checksum."""
+    """The places of a frame's values are known without the file; the values themselves have a checksum."""
     output = tmp_path / "out.usda"
     Simulation(scene, device=device).run(4, output=output, on_frame=lambda frame: frame < 2)
     places, cache = dict(np.load(tmp_path / "out.resume.npz")), tmp_path / "out.cache.usdc"

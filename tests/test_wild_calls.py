@@ -28,8 +28,8 @@ def test_wild_calls_are_refused_or_finite(owner, device):
     names = [name for name in names if owner in ("functions", name.partition(".")[0])]
     count = 3 if owner in HEAVY else 10
     results = [outcome for name in names for outcome in calls.outcomes(name, 7, list(range(count)))]
-    assert [(one.number, one.call, one.problem) for one in results if one.problem] == []
-    assert len(results) == count * len(names) and any(one.taken for one in results)
+    assert [(outcome.number, outcome.call, outcome.problem) for outcome in results if outcome.problem] == []
+    assert len(results) == count * len(names) and any(outcome.taken for outcome in results)
 
 
 def test_a_crash_is_seen(monkeypatch):

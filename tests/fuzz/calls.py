@@ -159,7 +159,7 @@ def _others(chance: random.Random, cache: dict = {}) -> dict:  # noqa: B006 - wo
 
 @dataclass
 class Outcome:
-    """What became of one call: its number, ``taken`` if it was not refused, and a problem if there is one."""
+    """The end of a call: its number, ``taken`` if it was not refused, and its problem, empty without one."""
 
     number: int
     call: str = ""

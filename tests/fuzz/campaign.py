@@ -73,7 +73,7 @@ class Verdict:
 
 
 class _Reached:
-    """What this process opens or connects to that it must not, as Python's audit hooks see it.
+    """Forbidden files and connections that this process opens, as Python's audit hooks see them.
 
     A hook stays for as long as the process: there is one of them, from the first use.
     """

@@ -1,4 +1,4 @@
-"""What a hostile author writes: addresses behind connections, devices, endless lists, slender bodies.
+"""Stages of a hostile author: addresses behind connections, devices, endless lists, slender bodies.
 
 Every fault takes a layer that lies in a folder, the prims of the seed and a source of chance, changes the layer, may
 write files beside it, and returns what it did.

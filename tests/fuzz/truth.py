@@ -361,7 +361,12 @@ def _moments(reading, result):
 def _last_sample(result) -> float:
     """The time code of the last step, which may be a little later than the last whole frame."""
     attributes = (prim.GetAttribute("warpmag:moment") for prim in result.Traverse())
-    return max([result.GetEndTimeCode(), *(time for one in attributes if one for time in one.GetTimeSamples()[-1:])])
+    return max(
+        [
+            result.GetEndTimeCode(),
+            *(time for attribute in attributes if attribute for time in attribute.GetTimeSamples()[-1:]),
+        ]
+    )
 
 
 def _shares(reading, prim) -> bool:
