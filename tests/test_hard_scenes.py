@@ -106,6 +106,15 @@ def test_far_from_the_origin(device):
     assert not run(near, device, 0.002).statistics.warnings()
 
 
+def test_farther_than_single_precision_reaches(device):
+    """At 1000 km positions are 63 mm apart: cells of a body coincide and induction would iterate to its limit."""
+    builder = new_builder()
+    add_ball(builder, (0.0, 0.0, R))
+    add_ball(builder, (1e6, 0.0, R), label="far")
+    with pytest.raises(warpmag.InputError, match=r"^far: is too far from the origin: positions .* 0.062 m apart"):
+        warpmag.Simulation(builder, device=device)
+
+
 def test_worlds_of_different_size_side_by_side(device):
     """Three worlds at one place, 1, 8 and 27 balls under a field: each moves as it does alone, in as long substeps."""
 

@@ -188,6 +188,41 @@ def test_vectors_and_numbers_of_other_libraries(kind):
     )
     settings = warpmag.Simulation(pair("cpu"), external_field=make((x, y, z)), device="cpu")
     np.testing.assert_allclose(settings.magnetics.external_field.numpy(), [(x, y, z)] * 2)
+    warpmag.add_balls(builder := new_builder(), POINTS, 0.005, color=make((0.1, 0.2, 0.3)))
+    np.testing.assert_allclose(builder.shape_color, [(0.1, 0.2, 0.3)] * 2, rtol=1e-6)
+
+
+NO_VECTORS = {
+    "bytes": b"\1\2\3",
+    "array of bytes": bytearray(b"\1\2\3"),
+    "view of bytes": memoryview(b"\1\2\3"),
+    "text": "123",
+    "texts": np.array(["1", "2", "3"]),
+    "objects": np.array([None] * 3),
+    "set": {1.0, 2.0, 3.0},
+    "table": {0: 1.0, 1: 2.0, 2: 3.0},
+}
+
+
+@pytest.mark.parametrize("kind", NO_VECTORS)
+def test_bytes_texts_and_sets_are_no_numbers(kind):
+    """Numbers without an order, or in a form that NumPy and Python read as numbers though nobody meant them."""
+    value, table, curve = NO_VECTORS[kind], [0.0, 1.0, 1.5], warpmag.MagnetizationCurve.from_bh
+    calls = {
+        "magnetization": lambda: warpmag.add_permanent(pair("cpu"), body=0, magnetization=value),
+        "color": lambda: warpmag.add_balls(pair("cpu"), POINTS, 0.005, color=value),
+        "label": lambda: warpmag.add_balls(pair("cpu"), POINTS, 0.005, label=0 if kind == "text" else value),
+        "radius": lambda: warpmag.add_balls(pair("cpu"), np.zeros((3, 3)), value),
+        "points": lambda: warpmag.add_coil(pair("cpu"), shape="polyline", points=value, ampere_turns=1.0),
+        "moments": lambda: warpmag.h_field(POINTS, value, POINTS),
+        "curve: fields": lambda: curve(value, table),
+        "curve: flux densities": lambda: curve([0.0, 1e3, 1e4], value),
+        "curve: saturation": lambda: curve([0.0, 1e3, 1e4], table, saturation=value),
+        "name": lambda: curve([0.0, 1e3, 1e4], table, name=0 if kind == "text" else value),
+    }
+    for name, call in calls.items():
+        with pytest.raises(warpmag.InputError, match=rf"^(\w+: )?{name}:? [^\n]*$"):
+            call()
 
 
 @pytest.mark.parametrize("argument", ["magnetization", "direction"])

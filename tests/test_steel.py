@@ -291,7 +291,12 @@ def test_bad_tables_are_refused(h, b, message):
 
 @pytest.mark.parametrize(
     "saturation,message",
-    [(1e5, "less than the last point's M"), (math.nan, "finite number"), (1e7, "saturate at 12.6 T"), ("1", "finite")],
+    [
+        (1e5, "less than the last point's M"),
+        (math.nan, "finite number"),
+        (1e7, "saturate at 12.6 T"),
+        ("1", "one real number"),
+    ],
 )
 def test_bad_saturations_are_refused(saturation, message):
     with pytest.raises(InputError, match=message):

@@ -178,6 +178,14 @@ def test_sound(tmp_path, case):
     assert [str(one) for one in survey(open_stage(write(tmp_path, SOUND[case]))).findings] == []
 
 
+@pytest.mark.parametrize("value", ["1e400", "nan"])
+def test_a_color_that_is_not_finite(value, tmp_path):
+    """It makes whole pictures not finite; `render` divides by it."""
+    path = write(tmp_path, ball(f"color3f[] primvars:displayColor = [({value}, 0.5, 0.5)]"))
+    with pytest.raises(InputError, match=r"^/Ball: color must be finite, got \((inf|nan), "):
+        import_scene(path)
+
+
 def test_an_open_mesh_that_its_hull_closes(tmp_path):
     body = mesh(CORNERS[:9], (3, 3, 3), more='uniform token physics:approximation = "convexHull"')
     (finding,) = survey(open_stage(write(tmp_path, body))).findings

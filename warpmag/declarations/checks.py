@@ -6,6 +6,7 @@ Stages, command lines and scripts use the same checks, so that an invalid value 
 import math
 import numbers
 import reprlib
+from collections.abc import Mapping, Set
 from typing import Any
 
 from warpmag.errors import InputError
@@ -16,6 +17,9 @@ _JOINT_GAP, _JOINT_ROUNDING = 1e-4, 1e-5
 The gap grows by this fraction, because poses are in single precision.
 """
 
+BYTES = (bytes, bytearray, memoryview)
+"""Types that NumPy and ``len`` read as numbers, although they are bytes."""
+_NO_SEQUENCES = (str, *BYTES, Set, Mapping)
 _REPR = reprlib.Repr()
 _REPR.maxother = 60
 
@@ -52,6 +56,12 @@ def real_number(name: str, value: Any) -> float:
         raise InputError(f"{name}: beyond the largest float, got {short_repr(value)}") from error
 
 
+def check_text(name: str, value: Any) -> None:
+    """Raise :class:`InputError` unless ``value`` is text."""
+    if not isinstance(value, str):
+        raise InputError(f"{name}: must be text, got {short_repr(value)}")
+
+
 def check_token(name: str, value: Any, allowed: tuple[str, ...]) -> None:
     """Raise :class:`InputError` unless ``value`` is one of ``allowed``."""
     if not isinstance(value, str) or value not in allowed:
@@ -83,7 +93,7 @@ def vector(name: str, values: Any) -> tuple[float, float, float]:
     if getattr(values, "shape", None) == (1, 3):  # a Warp array of one vector
         values = values[0]
     try:
-        three = len(values) == 3
+        three = len(values) == 3 and not isinstance(values, _NO_SEQUENCES)
     except TypeError:  # len() of a zero-dimensional NumPy array raises
         three = False
     if not three:

@@ -17,7 +17,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from warpmag.declarations.checks import plain_value, short_repr
+from warpmag.declarations.checks import BYTES, check_text, plain_value, real_number, short_repr
 from warpmag.errors import InputError
 
 MU0 = 1.2566370614359173e-06
@@ -119,9 +119,9 @@ class MagnetizationCurve:
         _check_points(name, h, m)
         m = np.maximum.accumulate(m)
         slope = float(_slopes(h, m)[-1])
-        saturation = float(m[-1] + h[-1] * slope) if saturation is None else plain_value(name, saturation)
-        _check_saturation(name, h, m, slope, saturation)
-        return cls(tuple(h.tolist()), tuple(m.tolist()), float(saturation), name)
+        saturation = float(m[-1] + h[-1] * slope) if saturation is None else saturation
+        saturation = _checked_saturation(name, h, m, slope, saturation)
+        return cls(tuple(h.tolist()), tuple(m.tolist()), saturation, name)
 
     @property
     def flux_densities(self) -> tuple[float, ...]:
@@ -173,7 +173,7 @@ def _slopes(h, m):
 def _numbers(name: str, quantity: str, values) -> np.ndarray:
     """Return values as a one-dimensional array of finite numbers."""
     try:
-        array = np.asarray(values)
+        array = np.asarray(None if isinstance(values, BYTES) else plain_value(f"{name}: {quantity}", values))
         if array.dtype.kind not in "iuf":
             raise TypeError
         array = array.astype(float)
@@ -189,6 +189,7 @@ def _numbers(name: str, quantity: str, values) -> np.ndarray:
 
 def _points(name: str, fields, quantity: str, values) -> tuple[np.ndarray, np.ndarray]:
     """Return the fields at the points of a curve, and the values of another quantity at these points."""
+    check_text("name", name)
     h, others = _numbers(name, "fields", fields), _numbers(name, quantity, values)
     if len(h) != len(others):
         raise InputError(f"{name}: {len(h)} fields, but {len(others)} values at them")
@@ -222,13 +223,11 @@ def _check_points(name: str, h, m) -> None:
         raise InputError(f"{name}: M must rise from the origin, but at H = {h[1]:g} A/m it is {m[1]:.4g} A/m")
 
 
-def _check_saturation(name: str, h, m, slope: float, saturation) -> None:
-    try:
-        is_number = math.isfinite(saturation) and not isinstance(saturation, bool)
-    except TypeError:
-        is_number = False
-    if not is_number:
-        raise InputError(f"{name}: saturation must be a finite number [A/m]")
+def _checked_saturation(name: str, h, m, slope: float, given) -> float:
+    """Return the saturation magnetization [A/m] if a curve can reach it from its last point."""
+    saturation = real_number(f"{name}: saturation", given)
+    if not math.isfinite(saturation):
+        raise InputError(f"{name}: saturation must be a finite number [A/m], got {saturation}")
     if saturation < m[-1] * (1.0 - 1e-9):
         raise InputError(f"{name}: saturation {saturation:g} A/m is less than the last point's M, {m[-1]:g} A/m")
     if slope == 0.0 and saturation > m[-1] * (1.0 + 1e-9):
@@ -238,6 +237,7 @@ def _check_saturation(name: str, h, m, slope: float, saturation) -> None:
             f"{name}: it would saturate at {MU0 * saturation:.3g} T, which no material does: H is in A/m, B in T; "
             "where a curve ends far from saturation, give the saturation"
         )
+    return saturation
 
 
 def _read_csv(path, name: str):

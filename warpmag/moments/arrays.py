@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warpmag.declarations.checks import check_token, short_repr
+from warpmag.declarations.checks import BYTES, check_token, short_repr
 from warpmag.declarations.magnets import MATERIAL_RANGE
 from warpmag.errors import InputError
 from warpmag.moments.ranks import launched_ranks
@@ -120,7 +120,7 @@ def real_array(name: str, value, *, single: bool = False) -> np.ndarray:
     if isinstance(value, (wp.array, wp.indexedarray)):
         value = value.numpy()
     try:
-        array = np.asarray(value)
+        array = np.asarray(None if isinstance(value, BYTES) else value)
     except Exception as error:  # a ragged list, or an object that fails to become an array
         raise InputError(f"{name}: no array of numbers: {short_repr(value)}") from error
     if np.ma.is_masked(value):

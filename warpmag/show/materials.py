@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdShade
 
+from warpmag.usd.values import value_of
+
 _MATERIALX = "ND_standard_surface_surfaceshader"
 _NAMES = {"diffuseColor": "base_color", "metallic": "metalness", "roughness": "specular_roughness", "clearcoat": "coat"}
 """Inputs of UsdPreviewSurface that are authored here, and their names in MaterialX's standard surface."""
@@ -66,9 +68,12 @@ def bound_material(prim: Usd.Prim) -> UsdShade.Material | None:
 
 
 def surface_value(material: UsdShade.Material | None, name: str) -> Any:
-    """Return the value of an input of a material's UsdPreviewSurface; None if there is none."""
+    """Return the value of an input of a material's UsdPreviewSurface; None if there is none.
+
+    A value of another type, or that is not finite, raises :class:`InputError`.
+    """
     surface = material.ComputeSurfaceSource()[0] if material else None
-    return surface.GetInput(name).Get() if surface and surface.GetInput(name) else None
+    return value_of(surface.GetPrim(), f"inputs:{name}") if surface else None
 
 
 def metalness(stage: Usd.Stage, path: str) -> float:

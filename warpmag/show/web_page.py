@@ -7,6 +7,7 @@ import io
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pxr import Usd, UsdGeom, Vt
@@ -16,6 +17,7 @@ from warpmag.show.glb import glb
 from warpmag.show.materials import bound_material, surface_value
 from warpmag.show.meshes import corner_normals, shape_of, triangles_of
 from warpmag.usd.read.transforms import rigid_part, rotation_of
+from warpmag.usd.values import number, value_of, vector
 
 _REACH = 2.0
 """Half the size of the scene in units of the page: viser's shadows and near plane suit this size."""
@@ -102,9 +104,9 @@ def _instances(stage: Usd.Stage, codes: np.ndarray) -> Iterator[_Batch]:
         upright = np.tile((0.0, 0.0, 0.0, 1.0), (prototypes.shape[1], 1))
         orientations = _values(instancer.GetOrientationsAttr(), codes, Vt.QuathArray, upright)
         scales = _values(instancer.GetScalesAttr(), codes, Vt.Vec3fArray, np.ones_like(upright))[..., 0]
-        for number in range(len(groups)):
-            points, faces = shapes[int(np.argmax(group == number))]
-            members = group[prototypes[0]] == number
+        for index in range(len(groups)):
+            points, faces = shapes[int(np.argmax(group == index))]
+            members = group[prototypes[0]] == index
             copies = positions[:, members], orientations[:, members], scales[:, members]
             yield _Batch(points, faces, *copies, palette, prototypes[:, members])
 
@@ -133,12 +135,13 @@ def _meshes(stage: Usd.Stage, codes: np.ndarray) -> Iterator[_Batch]:
 
 def _surface_of(prim: Usd.Prim) -> _Surface:
     """Return the surface of a mesh from its UsdPreviewSurface, or from its display color."""
-    color, material = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get(), bound_material(prim)
-    values = {"color": tuple(color[0])} if color else {}
+    color, material = value_of(prim, "primvars:displayColor"), bound_material(prim)
+    where = str(prim.GetPath())
+    values: dict[str, Any] = {"color": vector(f"{where}: displayColor", color[0])} if color else {}
     for name, key in (("diffuseColor", "color"), ("metallic", "metallic"), ("roughness", "roughness")):
         value = surface_value(material, name)
         if value is not None:
-            values[key] = tuple(value) if key == "color" else float(value)
+            values[key] = (vector if key == "color" else number)(f"{where}: {name}", value)
     return _Surface(**values)
 
 

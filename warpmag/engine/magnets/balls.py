@@ -10,7 +10,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warpmag.declarations import materials
-from warpmag.declarations.checks import check_not_negative, check_positive, check_vector, real_number
+from warpmag.declarations.checks import check_not_negative, check_positive, check_text, real_number, vector
 from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.likely_units import warn_of_magnetization, warn_of_radius
 from warpmag.declarations.magnets import Magnet
@@ -91,17 +91,18 @@ def add_balls(
     """
     check_registered(builder)
     poses = _poses(positions, orientations)
-    if color is not None:
-        check_vector("color", color)
+    color = None if color is None else vector("color", color)
+    if label is not None:
+        check_text("label", label)
     count = len(poses)
     radii = _radii(radius, count)
     response = {"saturation": saturation, "susceptibility": susceptibility, "curve": curve}
     permanent = {"magnetization": magnetization, "remanence": remanence, "direction": direction}
-    vector = None
+    own_magnetization = None
     if any(value is not None for value in permanent.values()):
-        vector = materials.magnetization_from(material=material, **permanent)
-        warn_of_magnetization(math.hypot(*vector))
-    magnet = _magnet(material, response, vector, recoil_permeability)
+        own_magnetization = materials.magnetization_from(material=material, **permanent)
+        warn_of_magnetization(math.hypot(*own_magnetization))
+    magnet = _magnet(material, response, own_magnetization, recoil_permeability)
     magnet.check("add_balls")
     warn_of_radius("add_balls", float(radii.max(initial=0.0)))
     balls = _next_balls(builder, count)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warpmag.declarations.attributes import NAMESPACE
-from warpmag.declarations.checks import check_whole, plain_value, short_repr
+from warpmag.declarations.checks import check_text, check_whole, plain_value, short_repr
 from warpmag.declarations.coils import LARGEST_POINT, Coil, FieldMap, SourceRecord, checked_vectors
 from warpmag.deprecation import keyword_arguments
 from warpmag.engine.magnets.attributes import check_registered
@@ -152,8 +152,7 @@ def _add_source(
     if not isinstance(body, str):
         check_whole("body", body)
     number = -1 if body == -1 else _single_body(builder, body)
-    if not isinstance(label, str):
-        raise InputError(f"label: must be text, got {short_repr(label)}")
+    check_text("label", label)
     frame = wp.transform() if xform is None else _checked_frame("xform", xform)
     values = {f"{NAMESPACE}:source": record.to_text(), f"{NAMESPACE}:strength": float(strength)}
     values[f"{NAMESPACE}:current_keys"] = keys

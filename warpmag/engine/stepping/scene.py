@@ -1,5 +1,6 @@
 """Imports a USD stage as a Newton builder with the magnets of the stage."""
 
+import math
 import os
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -107,6 +108,7 @@ def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, art
         if prim not in bodies:
             raise InputError(f"{prim}: Newton does not import this body")
     _check_masses(builder, stage, contents, bodies)
+    _check_colors(builder)
     for prim in enabled_joint_paths(stage):
         if prim not in joints:
             raise InputError(f"{prim}: Newton does not import this joint")
@@ -128,6 +130,13 @@ def _check_masses(builder: newton.ModelBuilder, stage, contents, bodies: dict[st
         free = path not in contents.kinematic
         if free and not builder.body_mass[bodies[path]] > 0.0 and has_volume(stage, path):
             raise InputError(f"{path}: its colliders have no mass: close their meshes, or author physics:mass")
+
+
+def _check_colors(builder: newton.ModelBuilder) -> None:
+    """Raise :class:`InputError` if a color that Newton finds for a shape is not finite: pictures would be none."""
+    for label, color in zip(builder.shape_label, builder.shape_color, strict=True):
+        if not all(map(math.isfinite, color)):
+            raise InputError(f"{label}: color must be finite, got {tuple(color)}")
 
 
 def _copy_balls(

@@ -219,9 +219,23 @@ class Simulation:
         self._center = self._positions(self.state).mean(axis=0) if len(self._moving) else np.zeros(3)
         overlap, _, self._statistics.overlapping = self._stepper.measure_contacts(_OVERLAP)
         self._stepper.set_initial_overlap(overlap)
-        if (moving := np.isfinite(sizes.thickness)).any():
-            farthest = np.abs(self.state.body_q.numpy()[moving, :3]).max()
-            self._statistics.coarseness = float(np.spacing(farthest) / sizes.thickness[moving].min())
+        self._statistics.coarseness = self._coarseness(sizes.thickness)
+
+    def _coarseness(self, thickness: np.ndarray) -> float:
+        """Return the largest spacing of single-precision positions over the thickness [m] of a body.
+
+        Raises:
+            InputError: A body is so far from the origin that its position is unknown by more than its thickness.
+        """
+        spacings = np.spacing(np.abs(self.state.body_q.numpy()[:, :3]).max(axis=1, initial=0.0))
+        coarseness = spacings / thickness  # the thickness of fixed bodies is infinite
+        worst = int(np.argmax(coarseness)) if len(coarseness) else -1
+        if worst >= 0 and coarseness[worst] > 1.0:
+            raise InputError(
+                f"{self.model.body_label[worst]}: is too far from the origin: positions in single precision are "
+                f"{spacings[worst]:.2g} m apart there, more than its thickness of {thickness[worst]:.2g} m"
+            )
+        return float(coarseness[worst]) if worst >= 0 else 0.0
 
     def _start_from_stage(self) -> None:
         """Start the induction from the moments of the stage, for example the result of an earlier run."""
