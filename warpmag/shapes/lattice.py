@@ -303,6 +303,8 @@ def _fill(parts: Sequence[Solid], spacing: float, across: int, together: bool) -
 
 def _concatenated(pieces: list[Pieces]) -> Pieces:
     """Return the pieces of several shapes in one grid as one record."""
+    if len(pieces) == 1:
+        return pieces[0]  # without copies: those of a long wire are large
     firsts = np.cumsum([0, *(len(p.index) for p in pieces)])
     pieces = [replace(p, piece=p.piece + first) for p, first in zip(pieces, firsts, strict=False)]
     columns = ("index", "filled", "piece", "moment", "share")

@@ -1,6 +1,7 @@
 """Samples Newton's shapes with moments."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import newton
@@ -16,6 +17,7 @@ from warpmag.shapes import lattice, polyhedra
 from warpmag.shapes.demagnetization import Coupling, coupling
 from warpmag.shapes.flat_faces import FlatFaces, faces_of_mesh, faces_of_polyhedron, joined
 from warpmag.shapes.polyhedra import Polyhedron
+from warpmag.shapes.shape_cache import FOLDER, ShapeCache
 from warpmag.shapes.softening import softened
 from warpmag.shapes.solids import boxes_meet
 from warpmag.shapes.uniform_response import with_surface_response
@@ -75,6 +77,7 @@ class ShapeSampler:
         rows, row_of = unique_rows(np.column_stack(columns))
         self.kinds = _kinds(*np.split(rows, (2, 3, 4, 7, 10), axis=1))[row_of]
         self._lattices: dict[tuple, BodyLattice] = {}
+        self._cache = shape_cache()
 
     def sample(self, shapes: list[int], magnet: Magnet) -> BodyLattice:
         """Return the moments of a magnet: shapes of one body, or one static shape.
@@ -104,6 +107,17 @@ class ShapeSampler:
                 np.concatenate([ball.radii for ball in balls]),
                 np.ones(len(shapes), dtype=int),
             )
+        key = (spacing, fixed, permanent, *(part for shape in shapes for part in self._content(shape)))
+        return self._cache.get(self._labels[shapes[0]], key, lambda: self._fill(shapes, spacing, fixed, permanent))
+
+    def _content(self, shape: int) -> tuple:
+        """Return the type, the size, the frame and the mesh of a shape."""
+        source: Any = self._sources[shape]
+        mesh = (np.asarray(source.vertices), np.asarray(source.indices)) if hasattr(source, "vertices") else ()
+        return int(self._types[shape]), self._scales[shape], self._frames[shape], *mesh
+
+    def _fill(self, shapes: list[int], spacing: float, fixed: bool, permanent: bool) -> BodyLattice:
+        """Return the moments of shapes that are not separate balls; see :meth:`sample`."""
         solids = [
             solid_of(self._types[shape], self._scales[shape], self._sources[shape]).posed(frame[:3], frame[3:])
             for shape, frame in zip(shapes, self._frames[shapes], strict=True)
@@ -171,6 +185,11 @@ class ShapeSampler:
         centers, radii = self._frames[shapes, :3], self._scales[shapes, 0]
         distances = np.linalg.norm(centers[:, None] - centers, axis=2) + 3.0 * np.diag(radii)
         return bool((distances >= (radii[:, None] + radii) * (1.0 - 1e-5)).all())
+
+
+def shape_cache() -> ShapeCache:
+    """Return the cache of sampled shapes, beside the kernels that Warp compiled."""
+    return ShapeCache(Path(wp.config.kernel_cache_dir) / FOLDER)
 
 
 def lengths_of(kind: int, scale: Any) -> list[float]:
