@@ -3,7 +3,8 @@
 from dataclasses import fields
 
 from warpmag.moments.layout import MomentMaterial
-from warpmag.moments.system import MomentSystem, SolverSettings
+from warpmag.moments.settings import SolverSettings
+from warpmag.moments.system import MomentSystem
 
 
 def moment_system(**arguments) -> MomentSystem:

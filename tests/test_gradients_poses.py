@@ -12,9 +12,9 @@ FIELD = (2e4, 0.0, 5e4)
 MAGNETIZATION = (0.0, 3e5, 8e5)
 
 
-def model_of_balls(**settings):
-    """Two iron balls, a magnet that hangs off its body's center, and a pair of magnets on one body."""
-    builder = new_builder()
+def model_of_balls(worlds=1, **settings):
+    """Two iron balls, a magnet that hangs off its body's center, and a pair of magnets on one body, in each world."""
+    builder = world = new_builder()
     add_ball(builder, (0.0, 0.0, 0.0))
     add_ball(builder, (0.001, 0.011, 0.0))
     turn = wp.quat_from_axis_angle(wp.normalize(wp.vec3(1.0, 2.0, 0.5)), 0.7)
@@ -23,6 +23,9 @@ def model_of_balls(**settings):
     for offset in (0.0, 0.011):
         builder.add_shape_sphere(pair, radius=R, xform=wp.transform((offset, 0.0, 0.0), wp.quat_identity()))
     warpmag.add_permanent(builder, body=pair, magnetization=MAGNETIZATION)
+    if worlds > 1:
+        builder = new_builder()
+        builder.replicate(world, worlds)
     model = builder.finalize(device="cpu", requires_grad=True)
     return model, warpmag.Magnetics(model, external_field=FIELD, rtol=1e-5, **settings)
 
@@ -77,6 +80,28 @@ def test_poses():
         change = body_forces(poses + 1e-6 * step, com) - body_forces(poses - 1e-6 * step, com)
         slope, typical = np.sum(seed * change) / 2e-6, np.linalg.norm(gradient[:, part])
         assert abs(np.sum(gradient * step) - slope) < 1e-4 * typical, name  # float32, and rtol of the induction
+
+
+def gradient_of(model, magnetics, poses, seed):
+    """Gradient of a function of the wrenches by the poses."""
+    state = model.state()
+    state.body_q.assign(poses)
+    with wp.Tape() as tape:
+        magnetics.apply(state)
+    state.body_f.grad.assign(seed)
+    tape.backward()
+    return state.body_q.grad.numpy()
+
+
+def test_worlds():
+    rng, (single, magnetics) = np.random.default_rng(3), model_of_balls()
+    poses = np.concatenate([single.body_q.numpy()] * 2)
+    poses[:, :3] += 1e-3 * rng.uniform(-0.5, 0.5, (8, 3))
+    seed = rng.normal(size=(8, 6))
+    expected = [gradient_of(single, magnetics, poses[rows], seed[rows]) for rows in (slice(0, 4), slice(4, 8))]
+    together = gradient_of(*model_of_balls(worlds=2), poses, seed)
+    # rtol of both solves is 1e-5, and the second linear solve of one model starts from the first one's solution
+    np.testing.assert_allclose(together, np.concatenate(expected), rtol=0.0, atol=1e-4 * np.abs(together).max())
 
 
 def test_what_has_no_gradient_raises():

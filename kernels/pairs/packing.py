@@ -7,6 +7,7 @@ The layout suits vector loads on a CPU and coalesced loads on a GPU:
 | content | position [m] | radius [m] | moment [A·m²] | body label |
 """
 
+from copy import copy
 from functools import cache
 from typing import Any
 
@@ -96,7 +97,7 @@ class PackedMoments:
 
         self.labels = integers(np.arange(n, dtype=np.int32) if labels is None else labels)
         self.groups = wp.zeros(n, dtype=wp.int32, device=device) if groups is None else integers(groups)
-        pitched = self._pitched(PACKED_ROWS)
+        pitched = self._whole = self._pitched(PACKED_ROWS)
         pitched[3].fill_(largest_radius)
         pitched[7].fill_(-1.0)
         self.packed: wp.array = pitched[:, :n] if n else pitched
@@ -110,6 +111,18 @@ class PackedMoments:
     def _pitched(self, rows: int) -> wp.array:
         """Rows of zeros, with padding after the last moment."""
         return wp.zeros((rows, (1 + -(-self.count // PITCH)) * PITCH), dtype=self.dtype, device=self.device)
+
+    def twin(self, labels=None) -> "PackedMoments":
+        """Return packed moments of the same radii and worlds with other labels, a Warp array; None means the same.
+
+        Both share the lists of overlapping moments, for moments at the same positions. Each is packed on its own.
+        """
+        twin = copy(self)
+        pitched = wp.clone(self._whole)
+        twin._whole, twin.labels = pitched, self.labels if labels is None else labels
+        twin.packed = pitched[:, : self.count] if self.count else pitched
+        twin.moments = twin.packed[4:7] if self.count else pitched
+        return twin
 
     def vectors(self, rows: int = 3) -> wp.array:
         """Allocate rows with the layout of :attr:`moments`, zero, shape [rows, n]."""
@@ -165,3 +178,32 @@ def launch_divide_by_volume(moments, radii, magnetizations):
     """Write the magnetizations M = m/V [A/m] of balls, shape [n]; zero where the radius is zero."""
     inputs, outputs = [moments, radii], [magnetizations]
     wp.launch(_divide_kernel(radii.dtype), radii.shape[0], inputs=inputs, outputs=outputs, device=radii.device)
+
+
+@cache
+def _volume_gradients_kernel(dtype):
+    vec3 = wp.types.vector(3, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def volume_gradients(
+        radii: wp.array[dtype],
+        moments: wp.array[vec3],
+        by_moments: wp.array[vec3],
+        by_magnetizations_out: wp.array[vec3],
+        by_radii_out: wp.array[dtype],
+    ):
+        i = wp.tid()
+        by_magnetizations_out[i] = ball_volume(radii[i]) * by_moments[i]
+        by_radii_out[i] = dtype(3.0) / radii[i] * wp.dot(moments[i], by_moments[i])
+
+    return volume_gradients
+
+
+def launch_volume_gradients(radii, moments, by_moments, by_magnetizations, by_radii):
+    """Write the gradients by magnetizations and radii of a function of the moments m = V M of balls, shape [n] each.
+
+    ``by_moments`` is the gradient of the function by the moments. Radii are positive.
+    """
+    inputs, outputs = [radii, moments, by_moments], [by_magnetizations, by_radii]
+    kernel = _volume_gradients_kernel(radii.dtype)
+    wp.launch(kernel, radii.shape[0], inputs=inputs, outputs=outputs, device=radii.device)

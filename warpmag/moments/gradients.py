@@ -7,8 +7,8 @@ cotangents v_i = ∂L/∂H(x_i) at targets x_i, the gradients are
     ∂L/∂x_i = (v_i·∇)H(x_i)            since H has no curl,
     ∂L/∂y_j = (m_j·∇)H_v(y_j)          with H_v the field of moments v.
 
-Sources and targets exchange their roles, and the existing sums compute all three, also by multipoles. Gradients of
-forces need one more derivative of the pair law, ``kernels.pairs.wrench_gradient``.
+Sources and targets exchange their roles, and the existing sums compute all three, also by multipoles. Fields of
+moments at each other, and of forces, have sums of their own, ``kernels.pairs.pair_gradients``.
 """
 
 from dataclasses import replace
@@ -16,9 +16,9 @@ from dataclasses import replace
 import warp as wp
 
 from warpmag.kernels.pairs.packing import PackedMoments
+from warpmag.kernels.pairs.pair_gradients import PairGradients
 from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.pairs.wrench import MU0
-from warpmag.kernels.pairs.wrench_gradient import launch_wrench_gradient
 from warpmag.kernels.shared.axpy import launch_add_scaled
 from warpmag.moments.pair_sums import BallMoments, SumsShape, pair_sums
 from warpmag.moments.tape import Gradients
@@ -57,6 +57,8 @@ def field_product(
         needed: Names of the gradients to compute.
         fmm_rtol: Relative error of the fast multipole method; None means sums over all pairs.
     """
+    if targets is None and "positions" in needed and fmm_rtol is None:
+        return _mutual_product(moments, cotangents)
     acting = replace(moments if targets is None else targets, moments=cotangents)
     gradients = {}
     if "moments" in needed:
@@ -70,12 +72,19 @@ def field_product(
     return gradients
 
 
+def _mutual_product(moments: BallMoments, cotangents: wp.array) -> Gradients:
+    """Return the gradients of a function of the field of moments at each other, from one sum over all pairs."""
+    packed, acting = _packed(moments), _packed(replace(moments, moments=cotangents))
+    sums = PairGradients(packed, (0, moments.count), cotangents=acting.moments)
+    sums.launch()
+    return {"positions": sums.by_positions, "moments": sums.by_moments}
+
+
 def wrench_product(
     moments: BallMoments,
     external_field: wp.array,
     force_cotangents: wp.array,
     torque_cotangents: wp.array,
-    labels: wp.array | None = None,
 ) -> Gradients:
     """Return the gradients by ``positions``, ``moments`` and ``external_field`` of a function of forces and torques.
 
@@ -84,16 +93,19 @@ def wrench_product(
         external_field: Applied field H0 [A/m], shape [n].
         force_cotangents: Gradient of the function by the forces [1/N], shape [n].
         torque_cotangents: Gradient of the function by the torques [1/(N·m)], shape [n].
-        labels: Body of each moment, shape [n]; moments of one body do not act on each other. None means one body each.
     """
-    radii = moments.radii
-    if radii is None:
-        radii = wp.zeros(moments.count, dtype=external_field.dtype._wp_scalar_type_, device=external_field.device)
-    labels_on_host = None if labels is None else labels.numpy()
-    packed = PackedMoments(radii, largest_radius=moments.largest_radius, labels=labels_on_host, moving=False)
+    sums = PairGradients(_packed(moments), (0, moments.count), external_field=external_field)
+    sums.launch(force_cotangents, torque_cotangents)
+    return {"positions": sums.by_positions, "moments": sums.by_moments, "external_field": sums.by_external_field}
+
+
+def _packed(moments: BallMoments) -> PackedMoments:
+    """Return packed moments, without lists of overlapping balls."""
+    radii, dtype = moments.radii, moments.positions.dtype._wp_scalar_type_
+    radii = wp.zeros(moments.count, dtype=dtype, device=moments.positions.device) if radii is None else radii
+    packed = PackedMoments(radii, largest_radius=moments.largest_radius, moving=False)
     moments.pack(packed)
-    gradients = launch_wrench_gradient(packed, external_field, force_cotangents, torque_cotangents)
-    return dict(zip(("positions", "moments", "external_field"), gradients, strict=True))
+    return packed
 
 
 def _shape(quantity: Quantity, moments: BallMoments, targets: BallMoments | None) -> SumsShape:

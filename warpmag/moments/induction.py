@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -27,11 +28,11 @@ from warpmag.moments.arrays import (
     real_array,
     resolve_context,
 )
-from warpmag.moments.induction_gradients import Equilibrium, wrench_product_of_balls
+from warpmag.moments.induction_gradients import BallGradients
 from warpmag.moments.layout import MomentMaterial
-from warpmag.moments.pair_sums import BallMoments
 from warpmag.moments.ranks import compare_arguments
-from warpmag.moments.system import MomentSystem, SolverSettings
+from warpmag.moments.settings import SolverSettings
+from warpmag.moments.system import MomentSystem
 from warpmag.moments.tape import check_constant, differentiable, paused_tape, record
 
 _FIELD_RANGE = {wp.float32: (3e-19, 1e12), wp.float64: (1e-100, 1e100)}
@@ -119,28 +120,26 @@ class InductionResult:
     def _record(self, tape: wp.Tape) -> None:
         """Record the gradients of the solve on a tape."""
         self._check_overlaps()
-        system, balls = self._system, self._balls
-        count, largest_radius = balls.count, float(balls.radii.max())
-        dipoles = BallMoments(balls.permanent_positions, balls.permanent_moments, None, 0.0)
-        moments = BallMoments(balls.positions, system.moments[:count], system.radii[:count], largest_radius)
-        h, rtol = system.h[:count], system.rtol
-        equilibrium = Equilibrium(moments, dipoles, h, system.material, rtol, system.fmm_rtol)
-        record(tape, self._arguments, [self.magnetizations, self.h_field], equilibrium.product)
+        results = [self.magnetizations, self.h_field]
+        record(tape, self._arguments, results, lambda *product: self._gradients.of_solve(*product))
+
+    @cached_property
+    def _gradients(self) -> BallGradients:
+        """Gradients at the state of the solve."""
+        system = self._system
+        assert system is not None
+        system.gradients.load(system.positions, system.moments, system.h, system.external_field)
+        return BallGradients(system.gradients, system.radii, self._balls.count)
 
     def _record_wrench(self, tape: wp.Tape, force: str, forces, torques) -> None:
         """Record the gradients of forces and torques on a tape."""
-        system, count = self._system, self._balls.count
-        arguments = {**self._arguments, "magnetizations": self.magnetizations}
+        settings, arguments = self._system.settings, {**self._arguments, "magnetizations": self.magnetizations}
         del arguments["saturation"], arguments["susceptibility"]  # they act through the magnetizations
-        _check_differentiable(system.settings, arguments)
+        _check_differentiable(settings, arguments)
         self._check_overlaps()
         if force != "kelvin":
             check_constant(arguments, f"the force {force!r} has none; use 'kelvin'")
-        moments = BallMoments(system.positions, system.moments, system.radii, float(self._balls.radii.max()))
-        record(
-            tape, arguments, [forces, torques],
-            lambda cotangents, _: wrench_product_of_balls(moments, count, system.external_field, cotangents),
-        )  # fmt: skip
+        record(tape, arguments, [forces, torques], lambda cotangents, _: self._gradients.of_wrench(cotangents))
 
     def _check_overlaps(self) -> None:
         """Raise ``InputError`` if radii of overlapping balls require gradients."""

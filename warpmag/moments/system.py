@@ -1,13 +1,13 @@
 """All magnetic moments of a simulation on one device: induction, forces and energy."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import warp as wp
 
-from warpmag.declarations.checks import check_count, check_token
-from warpmag.declarations.magnets import CONTACT_MODELS, DYNAMICS, check_force, check_rtol
+from warpmag.declarations.magnets import check_force
 from warpmag.errors import InputError
 from warpmag.kernels.applied.fields import AppliedForces
 from warpmag.kernels.applied.near_cells import FACE_SPLIT, NearCellBody
@@ -34,35 +34,10 @@ from warpmag.moments.dynamics import make_dynamics
 from warpmag.moments.fmm import SystemSums, fast_sums_for
 from warpmag.moments.layout import MomentLayout, MomentMaterial, change_material, make_layout, with_cells
 from warpmag.moments.ranks import current_ranks
+from warpmag.moments.settings import SolverSettings
+from warpmag.moments.system_gradients import SystemGradients
 from warpmag.shapes.demagnetization import Coupling
 from warpmag.shapes.face_charges import face_response
-
-
-@dataclass(frozen=True)
-class SolverSettings:
-    """Settings of the induction solve and of the forces, most of them as in :func:`warpmag.solve_induction`.
-
-    With ``single_torque`` the torque m × H is computed also for an inducible ball of a single moment. It is 0 in
-    equilibrium, where m is parallel to H, and measures the distance of the solve from equilibrium.
-    """
-
-    force: str = "kelvin"  # or ``zeeman``
-    dynamics: str = "theta"
-    contact_model: str = "dipole"
-    method: str = "direct"
-    rtol: float = 1e-3  # relative error of the inducible moments' magnetization at which a solve ends
-    max_evaluations: int = 1000  # field evaluations after which a solve ends with ``converged`` 0
-    step: float | None = None  # step κ = βΔtMs [dimensionless] of an explicit dynamics; None means its default
-    damping: float | None = None  # damping α [dimensionless] of ``llg``; None means its default
-    single_torque: bool = False
-
-    def check(self, dtype: str) -> None:
-        """Raise ``InputError`` for a setting out of range of ``dtype``, ``float32`` or ``float64``."""
-        check_token("contact_model", self.contact_model, CONTACT_MODELS)
-        check_token("dynamics", self.dynamics, DYNAMICS)
-        check_force("force", self.force, self.contact_model)
-        check_rtol("rtol", self.rtol, dtype)
-        check_count("max_evaluations", self.max_evaluations)
 
 
 class MomentSystem:
@@ -348,6 +323,12 @@ class MomentSystem:
     def rtol(self) -> float:
         """Relative error of the magnetization at which a solve ends."""
         return float(self.settings.rtol)
+
+    @cached_property
+    def gradients(self) -> SystemGradients:
+        """Gradients of solves and forces. Their buffers are allocated at the first access."""
+        arrays = self._packed, self._induction, self.material, self.worlds, self.world_ranges
+        return SystemGradients(*arrays, self.rtol, self.fmm_rtol)
 
     def start_cold(self, chosen: wp.array | None = None):
         """Start the next solve as the first one, from zero magnetization, in chosen worlds.

@@ -8,7 +8,8 @@ from warpmag.engine.magnets.grouping import BodyMagnet
 from warpmag.kernels.applied.solids import SolidMagnet
 from warpmag.kernels.near_contact.images import IronFaces
 from warpmag.moments.layout import MomentMaterial
-from warpmag.moments.system import MomentSystem, SolverSettings
+from warpmag.moments.settings import SolverSettings
+from warpmag.moments.system import MomentSystem
 
 KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 

@@ -6,9 +6,6 @@ from warpmag.errors import InputError
 from warpmag.kernels.rigid.bodies import BodyMoments
 from warpmag.kernels.rigid.pose_gradients import add_pose_gradients, spread_cotangents
 from warpmag.kernels.shared.axpy import launch_add_scaled
-from warpmag.moments.gradients import wrench_product
-from warpmag.moments.induction_gradients import Equilibrium
-from warpmag.moments.pair_sums import BallMoments
 from warpmag.moments.system import MomentSystem
 from warpmag.moments.tape import differentiable, paused_tape
 
@@ -24,7 +21,6 @@ def check_pose_gradients(system: MomentSystem) -> None:
         "a coil, a field map or the near field of a permanent body": system.sources is not None,
         "recoil permeability": system.bias is not None,
         "eddy currents": system.eddy is not None,
-        "a model of several worlds": len(system.world_ranges) > 1,
     }
     for reason, applies in reasons.items():
         if applies:
@@ -52,42 +48,24 @@ def record_forces(tape: wp.Tape, system: MomentSystem, magnets: BodyMoments, mod
 
 
 class _SolvedMoments:
-    """Copy of the moments, the field and the forces of a system of one world after a solve."""
+    """Copy of the moments, the fields and the forces of a system after a solve."""
 
     def __init__(self, system: MomentSystem):
         """Copy the arrays."""
         self.positions, self.forces = wp.clone(system.positions), wp.clone(system.forces)
-        self._moments, self._h, self._system = wp.clone(system.moments), wp.clone(system.h), system
+        self._moments, self._h, self._external_field = map(wp.clone, (system.moments, system.h, system.external_field))
+        self._system = system
 
     def product(self, force_cotangents: wp.array, torque_cotangents: wp.array) -> tuple[wp.array, wp.array]:
         """Return the gradients by positions and by permanent moments, shape [n] each; others are not meaningful."""
-        system = self._system
-        ((_, first, count),) = system.world_ranges
-        moments = self._balls(0, count)
-        gradients = wrench_product(
-            moments, system.external_field, force_cotangents, torque_cotangents, labels=system.bodies
-        )
-        by_positions, by_moments = gradients["positions"], gradients["moments"]
-        if first == 0:
-            return by_positions, by_moments
-        equilibrium = Equilibrium(
-            self._balls(0, first), self._balls(first, count), self._h[:first], system.material, system.rtol,
-            system.fmm_rtol,
-        )  # fmt: skip
-        needed = {"positions"} | ({"permanent: positions", "permanent: moments"} if count > first else set())
-        more = equilibrium.product_of_moments(by_moments[:first], needed)
-        for name, total, rows in (
-            ("positions", by_positions, slice(0, first)),
-            ("permanent: positions", by_positions, slice(first, count)),
-            ("permanent: moments", by_moments, slice(first, count)),
+        gradients = self._system.gradients
+        gradients.load(self.positions, self._moments, self._h, self._external_field)
+        sums = gradients.wrench(force_cotangents, torque_cotangents)
+        gradients.solve(sums.by_moments, warm=True)  # from the solution of the substep after it
+        gradients.check()
+        for partial, total in (
+            (sums.by_positions, gradients.by_positions),
+            (sums.by_moments, gradients.by_moments),
         ):
-            if name in needed:
-                launch_add_scaled(more[name], total[rows])
-        return by_positions, by_moments
-
-    def _balls(self, first: int, end: int) -> BallMoments:
-        if first == end:
-            empty = wp.empty(0, dtype=wp.vec3, device=self.positions.device)
-            return BallMoments(empty, empty, None, 0.0)
-        radii, largest = self._system.radii[first:end], self._system.largest_radius
-        return BallMoments(self.positions[first:end], self._moments[first:end], radii, largest)
+            launch_add_scaled(partial, total)
+        return gradients.by_positions, gradients.by_moments

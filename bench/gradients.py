@@ -1,0 +1,165 @@
+"""Times of gradients beside the calls that they belong to: ``python -m bench.gradients [--device cuda:0]``.
+
+``calls`` are the field, forces and torques, and the equilibrium of a touching pile of balls, at increasing numbers of
+balls. ``worlds`` is one gradient in each of many worlds: a solve, forces, and the gradient of a function of the forces
+by all positions, in one sequence of launches (a graph on a GPU). Each measurement is one JSON line. Gradients are
+checked against a central difference along a random direction before they are timed.
+"""
+
+import argparse
+
+import numpy as np
+import warp as wp
+
+from bench.cases import RADIUS, SATURATION, touching_pile
+from bench.machine import line_writer
+from bench.run import make_system
+from bench.systems import moment_system, solve_cold
+from bench.timing import measure
+from warpmag.kernels.pairs.evaluate import PairEvaluation
+from warpmag.kernels.pairs.packing import PackedMoments
+from warpmag.kernels.pairs.pair_gradients import PairGradients
+from warpmag.kernels.pairs.pair_law import Quantity
+from warpmag.moments.system import MomentSystem
+
+_SIZES = {"cpu": (243, 1000, 4096), "cuda": (243, 1000, 4096, 16384)}
+_WORLDS, _BALLS = {"cpu": 32, "cuda": 4096}, 64
+
+
+def _cotangents(system: MomentSystem, count: int) -> list[wp.array]:
+    """Return random arrays of unit vectors' size, one vector for each moment."""
+    rng = np.random.default_rng(5)
+    shape = system.count, 3
+    return [wp.array(rng.normal(size=shape), dtype=system.h.dtype, device=system.device) for _ in range(count)]
+
+
+def _load(system: MomentSystem) -> None:
+    system.gradients.load(system.positions, system.moments, system.h, system.external_field)
+
+
+def _differentiate_forces(system: MomentSystem, forces, torques) -> None:
+    """Compute the gradient of a function of forces and torques by positions, through the equilibrium."""
+    _load(system)
+    sums = system.gradients.wrench(forces, torques)
+    system.gradients.solve(sums.by_moments)
+
+
+def _check(system: MomentSystem, forces, torques) -> float:
+    """Return the relative error of the gradient along a random direction against a central difference, in float64."""
+    solve_cold(system)
+    system.apply_forces()
+    _differentiate_forces(system, forces, torques)
+    gradient = system.gradients.by_positions.numpy() + system.gradients.wrench(forces, torques).by_positions.numpy()
+    start, step = system.positions.numpy().copy(), 1e-7 * RADIUS * np.random.default_rng(6).normal(size=gradient.shape)
+    values = []
+    for sign in (1.0, -1.0):
+        system.positions.assign(start + sign * step)
+        solve_cold(system)
+        system.apply_forces()
+        values.append(
+            sum(np.sum(a.numpy() * b.numpy()) for a, b in ((forces, system.forces), (torques, system.torques)))
+        )
+    system.positions.assign(start)
+    difference = 0.5 * (values[0] - values[1])
+    return float(abs(np.sum(gradient * step) - difference) / (np.linalg.norm(gradient) * np.linalg.norm(step)))
+
+
+def run_calls(count: int, device) -> dict:
+    """Time the field, the wrench and the equilibrium of a pile, and their gradients."""
+    system = make_system(count, "float32", device)
+    solve_cold(system)
+    system.apply_forces()
+    forces, torques = _cotangents(system, 2)
+    packed = PackedMoments(system.radii, largest_radius=RADIUS, moving=False)
+    packed.pack(system.positions, system.moments)
+    acting = packed.twin()
+    acting.pack(system.positions, forces)
+    fields = PairGradients(packed, (0, count), cotangents=acting.moments)
+    _load(system)
+
+    def sum_cotangents():
+        acting.find_overlaps()
+        system.gradients.evaluate()
+
+    gradients, rotatable = system.gradients, wp.ones(count, dtype=int, device=device)
+    wrench = PairEvaluation(
+        Quantity.WRENCH, [(0, count, 0, count)], packed, packed, system.external_field, system.forces,
+        with_torque=rotatable, torques=system.torques,
+    )  # fmt: skip
+    times = {
+        "field": lambda: (packed.find_overlaps(), system.evaluate()),
+        "field_by_moments": sum_cotangents,
+        "field_by_moments_and_positions": fields.launch,
+        "wrench": lambda: (packed.find_overlaps(), wrench.launch()),
+        "wrench_gradient": lambda: gradients.wrench(forces, torques),
+        "cold_solve": lambda: solve_cold(system),
+        "solve_gradient": lambda: (_load(system), gradients.solve(forces)),
+    }
+    result = {f"{name}_seconds": measure(work, device) for name, work in times.items()}
+    result |= {
+        "evaluations": int(system.evaluations.numpy()[0]),
+        "gradient_evaluations": int(gradients.evaluations()[0]),
+    }
+    nearby = wp.array(forces.numpy() + 0.01 * torques.numpy(), dtype=forces.dtype, device=device)
+    gradients.solve(nearby, warm=True)
+    result["warm_gradient_evaluations"] = int(gradients.evaluations()[0])
+    return result
+
+
+def make_worlds(worlds: int, count: int, device, dtype: str = "float32", rtol: float = 1e-3) -> MomentSystem:
+    """Return a system of one touching pile of balls in each world."""
+    system = moment_system(
+        radii=np.full(worlds * count, RADIUS), worlds=np.repeat(np.arange(worlds), count), saturation=SATURATION,
+        external_field=[0.0, 0.0, 0.5 * SATURATION], dtype=dtype, device=device, rtol=rtol,
+    )  # fmt: skip
+    system.positions.assign(np.concatenate([1.01 * touching_pile(count, seed) for seed in range(worlds)]))
+    return system
+
+
+def run_worlds(worlds: int, device) -> dict:
+    """Time a cold solve, forces and their gradient in each of many worlds."""
+    exact = make_worlds(3, _BALLS, device, "float64", 1e-12)
+    error = _check(exact, *_cotangents(exact, 2))
+    system = make_worlds(worlds, _BALLS, device)
+    forces, torques = _cotangents(system, 2)
+
+    def solve_and_apply():
+        solve_cold(system)
+        system.apply_forces()
+
+    solve_and_apply()
+    seconds = {
+        "solve_seconds": measure(solve_and_apply, device),
+        "gradient_seconds": measure(lambda: _differentiate_forces(system, forces, torques), device),
+    }
+    return {
+        "worlds": worlds,
+        **seconds,
+        "world_gradients_per_second": worlds / seconds["gradient_seconds"],
+        "solves_and_gradients_per_second": worlds / sum(seconds.values()),
+        "gradient_evaluations": float(system.gradients.evaluations().mean()),
+        "error": error,
+    }
+
+
+def main() -> None:
+    """Run the cases named on the command line."""
+    parser = argparse.ArgumentParser(prog="python -m bench.gradients", description=__doc__.partition("\n")[0])
+    parser.add_argument("cases", nargs="*", default=("calls", "worlds"), help="calls, worlds (default: both)")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--sizes", type=int, nargs="+", help="numbers of balls of calls")
+    parser.add_argument("--worlds", type=int, help="number of worlds")
+    options = parser.parse_args()
+    wp.config.log_level = wp.LOG_WARNING
+    device = wp.get_device(options.device)
+    kind = "cuda" if device.is_cuda else "cpu"
+    write = line_writer(device)
+    if "calls" in options.cases:
+        for count in options.sizes or _SIZES[kind]:
+            write({"case": "calls", "count": count, **run_calls(count, device)})
+    if "worlds" in options.cases:
+        write({"case": "worlds", "count": _BALLS, **run_worlds(options.worlds or _WORLDS[kind], device)})
+
+
+if __name__ == "__main__":
+    main()
