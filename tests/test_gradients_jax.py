@@ -20,6 +20,12 @@ def double_precision():
     jax.config.update("jax_enable_x64", before)
 
 
+@pytest.fixture(params=["own", "given"])
+def place(request, device):
+    """Device argument of calls: None for that of the arrays, whose memory is shared, or the device under test."""
+    return None if request.param == "own" else device
+
+
 def arrays(*shapes, scale=1.0):
     rng = np.random.default_rng(11)
     return [jnp.asarray(scale * rng.normal(size=shape)) for shape in shapes]
@@ -29,33 +35,33 @@ def check(function, arguments):
     check_grads(function, arguments, order=1, modes=["rev"], eps=1e-5, rtol=1e-5, atol=1e-9)
 
 
-def test_field(device):
+def test_field(place, device):
     x, m, targets = arrays((4, 3), (4, 3), (3, 3))
-    field = jax.jit(lambda *a: warpmag.jax.h_field(*a, radii=0.1, device=device))(x, m, targets)
+    field = jax.jit(lambda *a: warpmag.jax.h_field(*a, radii=0.1, device=place))(x, m, targets)
     expected = warpmag.h_field(*map(np.asarray, (x, m, targets)), radii=0.1, dtype="float64", device=device)
     assert field.dtype == jnp.float64 and np.allclose(field, expected, rtol=1e-12, atol=0.0)
-    check(lambda *a: warpmag.jax.h_field(*a, device=device), (x, m, targets))
+    check(lambda *a: warpmag.jax.h_field(*a, device=place), (x, m, targets))
 
 
-def test_wrench(device):
+def test_wrench(place):
     x, m, field = arrays((4, 3), (4, 3), (3,))
 
     def scaled(x, m, field):  # newtons would be too small for the absolute tolerance
-        return [1e6 * part for part in warpmag.jax.wrench(x, m, external_field=field, device=device)]
+        return [1e6 * part for part in warpmag.jax.wrench(x, m, external_field=field, device=place)]
 
     check(scaled, (x, m, field))
     batch = jax.vmap(lambda x: scaled(x, m, field)[0])(jnp.stack([x, 2.0 * x]))
     assert np.allclose(batch[1], scaled(2.0 * x, m, field)[0], rtol=1e-12)
 
 
-def test_equilibrium(device):
+def test_equilibrium(place):
     noise, field, dipoles, dipole_moments = arrays((4, 3), (3,), (2, 3), (2, 3), scale=0.1)
     lattice = np.stack(np.meshgrid([0, 1], [0, 1], [0]), -1).reshape(-1, 3)
 
     def solve(noise, radii, saturation, susceptibility, field, dipoles, dipole_moments):
         result = warpmag.jax.solve_induction(
             lattice + noise, radii, saturation=saturation, susceptibility=susceptibility, rtol=1e-12,
-            external_field=20.0 * field, permanent=(dipoles + 2.0, dipole_moments), device=device,
+            external_field=20.0 * field, permanent=(dipoles + 2.0, dipole_moments), device=place,
         )  # fmt: skip
         return result.magnetizations, result.h_field, 1e6 * result.wrench()[0]
 
@@ -63,9 +69,9 @@ def test_equilibrium(device):
     check(solve, (noise, radii, jnp.float64(2.0), jnp.float64(30.0), field, dipoles, dipole_moments))
 
 
-def test_what_has_no_gradient_raises(device):
+def test_what_has_no_gradient_raises(place):
     x, m = arrays((3, 3), (3, 3))
     with pytest.raises(Exception, match="radii: requires a gradient"):
-        jax.grad(lambda radius: warpmag.jax.h_field(x, m, radii=radius, device=device).sum())(0.1)
+        jax.grad(lambda radius: warpmag.jax.h_field(x, m, radii=radius, device=place).sum())(0.1)
     with pytest.raises(warpmag.InputError, match="positions: must be float32 or float64"):
         warpmag.jax.h_field(x.astype(jnp.float16), m)

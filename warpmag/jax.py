@@ -2,8 +2,9 @@
 
 The functions are those of ``warpmag`` with JAX arrays in place of arrays. The type is that of ``positions``,
 ``float32`` or ``float64``; other arrays are converted. The functions may be part of ``jax.jit``, ``jax.grad`` and
-``jax.vmap``. JAX calls them on the host (``jax.pure_callback``): arrays of a CPU are shared, arrays of a GPU are copied
-to the host and back. Gradients (``docs/howto/gradients.md``) are of reverse mode and have no gradients of their own.
+``jax.vmap``. Kernels read and write the memory of JAX's arrays on JAX's stream (``wp.jax_callable``). With ``device``,
+the Warp device that computes, arrays are copied through the host (``jax.pure_callback``). Gradients
+(``docs/howto/gradients.md``) are of reverse mode and have no gradients of their own.
 
 Example:
     >>> import jax
@@ -20,9 +21,10 @@ Example:
 # pyright: reportAttributeAccessIssue=false
 # pyright takes ``import torch`` and ``import jax`` here for the modules of these names in this folder
 
+import inspect
 import math
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import jax  # pyright: ignore[reportMissingImports]
@@ -35,6 +37,7 @@ from warpmag.errors import InputError
 from warpmag.moments import fields, induction
 from warpmag.moments.arrays import DTYPES, dtype_name, vec3_type
 
+_POSITIONAL = inspect.Parameter.POSITIONAL_OR_KEYWORD
 _SCALARS = ("radii", "target_radii", "saturation", "susceptibility")
 """Arguments of one number for each ball; the others are vectors."""
 
@@ -42,7 +45,7 @@ _SCALARS = ("radii", "target_radii", "saturation", "susceptibility")
 def h_field(positions, moments, targets=None, *, radii=None, target_radii=None, method="auto", rtol=None, device=None):
     """Return the field H [A/m] of moments, shape [t, 3]; see :func:`warpmag.h_field`.
 
-    Gradients by ``positions``, ``moments`` and ``targets``. ``device`` is the Warp device that computes.
+    Gradients by ``positions``, ``moments`` and ``targets``. Computes on the arrays' device, or on ``device``.
     """
     arrays = {"positions": positions, "moments": moments, "targets": targets}
     arrays |= {"radii": radii, "target_radii": target_radii}
@@ -54,7 +57,7 @@ def h_field(positions, moments, targets=None, *, radii=None, target_radii=None, 
 def wrench(positions, moments, *, radii=None, external_field=None, method="auto", rtol=None, device=None):
     """Return forces [N] and torques [N·m], shape [n, 3] each; see :func:`warpmag.wrench`.
 
-    Gradients by ``positions``, ``moments`` and ``external_field``. ``device`` is the Warp device that computes.
+    Gradients by ``positions``, ``moments`` and ``external_field``. Computes on the arrays' device, or on ``device``.
     """
     arrays = {"positions": positions, "moments": moments, "radii": radii, "external_field": external_field}
     call = _Call("wrench", (("method", method), ("rtol", rtol)), device)
@@ -100,7 +103,7 @@ def solve_induction(
 ) -> InductionArrays:  # fmt: skip
     """Return the magnetic equilibrium of inducible balls; see :func:`warpmag.solve_induction`.
 
-    Gradients by all arrays, with a relative error of about ``rtol``. ``device`` is the Warp device that computes.
+    Gradients by all arrays, with a relative error of about ``rtol``. Computes on the arrays' device, or on ``device``.
     """
     dipoles, dipole_moments = (np.zeros((0, 3)),) * 2 if permanent is None else permanent
     arrays = {"positions": positions, "radii": radii, "saturation": saturation, "susceptibility": susceptibility}
@@ -138,52 +141,90 @@ class _Call:
     options: tuple
     device: Any
 
-    def shapes(self, arrays: dict) -> list:
-        """Return shape and type of the results."""
-        like = arrays.get("targets", arrays["positions"])
-        return [jax.ShapeDtypeStruct(like.shape, like.dtype)] * (1 if self.function == "h_field" else 2)
-
-    def results(self, arrays: dict) -> list[np.ndarray]:
-        """Return the results of NumPy arrays."""
-        return [result.numpy() for result in self._evaluate(self._upload(arrays, ()))]
-
-    def gradients(self, arrays: dict, needed: dict, cotangents: list, initial) -> dict:
-        """Return the gradients by the arrays that ``needed`` names; a solve starts from the solution ``initial``."""
-        inputs = self._upload(arrays, needed)
-        more = {"initial": np.asarray(initial)} if self.function == "solve_induction" else {}
-        with wp.Tape() as tape:
-            results = self._evaluate(inputs, **more)
-        for result, cotangent in zip(results, cotangents, strict=True):
-            result.grad.assign(np.asarray(cotangent))
-        tape.backward()
-        return {name: inputs[name].grad.numpy() for name in needed}
-
-    def _upload(self, arrays: dict, needed) -> dict[str, wp.array]:
-        def upload(name, value):
-            value = np.asarray(value)
-            dtype = DTYPES[value.dtype.name]
-            dtype = dtype if name in _SCALARS else vec3_type(dtype)
-            return wp.array(value, dtype=dtype, device=self.device, copy=False, requires_grad=name in needed)
-
-        return {name: upload(name, value) for name, value in arrays.items()}
-
-    def _evaluate(self, arrays: dict[str, wp.array], **more) -> list[wp.array]:
+    def results(self, arrays: dict[str, wp.array], **more) -> list[wp.array]:
+        """Return the results of Warp arrays."""
         dtype = dtype_name(arrays["positions"].dtype._wp_scalar_type_)
-        options = {**dict(self.options), **more, "dtype": dtype, "device": self.device}
+        options = {**dict(self.options), **more, "dtype": dtype}
         if self.function == "h_field":
             return [fields.h_field(**arrays, **options)]
         if self.function == "wrench":
             return list(fields.wrench(**arrays, **options))
         arrays = dict(arrays)
-        permanent = arrays.pop("dipoles"), arrays.pop("dipole_moments")
+        permanent = [arrays.pop(name, np.zeros((0, 3))) for name in ("dipoles", "dipole_moments")]
         result = induction.solve_induction(permanent=permanent, **arrays, **options)
         return [result.magnetizations, result.h_field]
+
+    def gradients(self, arrays: dict[str, wp.array], needed: tuple[str, ...]) -> list:
+        """Return the gradients by the arrays that ``needed`` names; ``_backward`` has the other arrays."""
+        more = {"initial": arrays.pop("result_0")} if self.function == "solve_induction" else {}
+        cotangents = [arrays.pop(name) for name in ("cotangent_0", "cotangent_1") if name in arrays]
+        for name in needed:
+            arrays[name].requires_grad = True
+        with wp.Tape() as tape:
+            results = self.results(arrays, **more)
+        for result, cotangent in zip(results, cotangents, strict=True):
+            wp.copy(result.grad, cotangent)
+        tape.backward()
+        return [arrays[name].grad for name in needed]
+
+    def run(self, needed: tuple[str, ...] | None, arrays: dict[str, wp.array]) -> list[wp.array]:
+        """Return gradients by ``needed``, or results if that is None."""
+        return self.results(arrays) if needed is None else self.gradients(arrays, needed)
+
+    def launch(self, needed: tuple[str, ...] | None, arrays: dict, counts: dict[str, int]) -> list:
+        """Return the JAX arrays of :meth:`run`; ``counts`` are their lengths by name."""
+        dtype = arrays["positions"].dtype
+        shapes = [jax.ShapeDtypeStruct((n, 3)[: 1 if name in _SCALARS else 2], dtype) for name, n in counts.items()]
+        if not all(len(array) for array in arrays.values()):
+            return [jnp.zeros(shape.shape, dtype) for shape in shapes]
+        if self.device is None:
+            shared = _shared_function(self, needed, tuple(arrays), tuple(counts), dtype.name)
+            results = shared(*arrays.values(), output_dims={f"{name}_out": n for name, n in counts.items()})
+            return list(results)
+
+        def through_host(values):
+            inputs = {
+                name: wp.array(np.asarray(value), dtype=_kind(name, dtype.name), device=self.device, copy=False)
+                for name, value in values.items()
+            }
+            return [result.numpy() for result in self.run(needed, inputs)]
+
+        return jax.pure_callback(through_host, shapes, arrays, vmap_method="sequential")
+
+
+def _kind(name: str, dtype: str) -> type:
+    """Return the Warp type of the entries of an array by its name: numbers or vectors."""
+    return DTYPES[dtype] if name in _SCALARS else vec3_type(DTYPES[dtype])
+
+
+@lru_cache(maxsize=256)
+def _shared_function(call: _Call, needed, inputs: tuple[str, ...], outputs: tuple[str, ...], dtype: str):
+    """Return a function of JAX arrays that makes a call on Warp arrays of their memory."""
+
+    def run(*arrays):
+        results = call.run(needed, dict(zip(inputs, arrays, strict=False)))
+        for result, out in zip(results, arrays[len(inputs) :], strict=True):
+            wp.copy(out, result)
+
+    kinds = {name: _kind(name, dtype) for name in inputs} | {f"{name}_out": _kind(name, dtype) for name in outputs}
+    run.__annotations__ = {name: wp.array(dtype=kind) for name, kind in kinds.items()}
+    run.__signature__ = inspect.Signature([inspect.Parameter(name, _POSITIONAL) for name in kinds])
+    # calls check values on the host, which no graph can capture
+    mode = wp.JaxCallableGraphMode.NONE
+    return wp.jax_callable(run, num_outputs=len(outputs), graph_mode=mode, vmap_method="sequential")
+
+
+def _filled(arrays: dict) -> dict:
+    """Return the arrays with entries, such as no permanent dipoles where there are none."""
+    return {name: array for name, array in arrays.items() if len(array) or name not in ("dipoles", "dipole_moments")}
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _differentiable(call: _Call, arrays: dict):
     """Return the results of a call as JAX arrays."""
-    return jax.pure_callback(call.results, call.shapes(arrays), arrays, vmap_method="sequential")
+    like = arrays.get("targets", arrays["positions"])
+    counts = {f"result_{k}": len(like) for k in range(1 if call.function == "h_field" else 2)}
+    return call.launch(None, _filled(arrays), counts)
 
 
 def _forward(call: _Call, primals: dict):
@@ -194,15 +235,16 @@ def _forward(call: _Call, primals: dict):
 
 
 def _backward(call: _Call, residuals, cotangents):
-    arrays, needed, results = residuals
-    shapes = {name: jax.ShapeDtypeStruct(arrays[name].shape, arrays[name].dtype) for name in needed}
-    seeds = [jnp.zeros(c.shape, c.dtype) if isinstance(c, SymbolicZero) else c for c in cotangents]
-    # names are static: the keys of a tree without leaves
-    gradients = jax.pure_callback(
-        lambda arrays, seeds, initial: call.gradients(arrays, needed, seeds, initial),
-        shapes, arrays, seeds, results[0], vmap_method="sequential",
-    )  # fmt: skip
-    return ({name: gradients.get(name) for name in arrays},)
+    arrays, needed, results = residuals  # names are static: the keys of a tree without leaves
+    inputs = _filled(arrays)
+    counts = {name: len(inputs[name]) for name in needed if name in inputs}
+    for k, c in enumerate(cotangents):
+        inputs[f"cotangent_{k}"] = jnp.zeros(c.shape, c.dtype) if isinstance(c, SymbolicZero) else c
+    if call.function == "solve_induction":
+        inputs["result_0"] = results[0]  # the solve starts from its solution
+    gradients = dict(zip(counts, call.launch(tuple(counts), inputs, counts), strict=True))
+    zeros = {name: jnp.zeros_like(arrays[name]) for name in needed if name not in counts}
+    return ({name: (gradients | zeros).get(name) for name in arrays},)
 
 
 _differentiable.defvjp(_forward, _backward, symbolic_zeros=True)
