@@ -6,8 +6,9 @@
     python -m tests.fuzz --count 3000 --workers 14          fourteen processes at a time
     python -m tests.fuzz --seed 7 --only 1234               one stage, which is kept in the folder
 
-Stages with problems are kept in the folder, beside ``verdicts.jsonl`` with a line about each stage. Ends with 1 where
-there are problems. Everything runs on the CPU: a GPU does not survive a fork, so it is hidden from the start.
+Stages with problems are kept in the folder, beside ``verdicts.jsonl`` with a line about each stage. ``--resume`` goes
+on behind the lines that are there. Ends with 1 where there are problems. Everything runs on the CPU: a GPU does not
+survive a fork, so it is hidden from the start.
 """
 
 import argparse
@@ -33,6 +34,7 @@ def main() -> int:
     parser.add_argument("--only", type=int, metavar="N", help="number of the only stage, which is kept")
     parser.add_argument("--batch", type=int, default=1, help="stages of one process (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=1, help="processes at a time (default: %(default)s)")
+    parser.add_argument("--resume", action="store_true", help="leave out the stages that have a line in the folder")
     parser.add_argument("--fresh", action="store_true", help="a fresh interpreter for each command")
     parser.add_argument("-o", "--output", type=Path, default=Path("fuzz_out"), help="folder (default: %(default)s)")
     options = parser.parse_args()
@@ -57,13 +59,12 @@ def main() -> int:
     if not options.fresh:
         warm_up(sources, in_process)
     numbers = [options.only] if options.only is not None else range(options.first, options.first + options.count)
-    table, slowest = Counter(), 0.0
+    verdicts = _earlier(folder / "verdicts.jsonl") if options.resume else []
+    left = [number for number in numbers if number not in {verdict.number for verdict in verdicts}]
     with open(folder / "verdicts.jsonl", "a", encoding="utf-8") as file:
-        for verdict in campaign.verdicts(list(numbers)):
+        for verdict in campaign.verdicts(left):
             print(json.dumps(asdict(verdict), ensure_ascii=False), file=file, flush=True)
-            table[verdict.form, {0: "run", 2: "refused"}.get(verdict.run, "neither")] += 1
-            table[verdict.form, "problems"] += bool(verdict.problems)
-            slowest = max(slowest, verdict.seconds)
+            verdicts.append(verdict)
             if verdict.problems or options.only is not None:
                 print(
                     f"seed {options.seed}, {verdict.number}: {verdict.done}\n    {verdict.line}",
@@ -71,18 +72,34 @@ def main() -> int:
                     sep="\n    ",
                     flush=True,
                 )
-    _print_table(table)
-    print(f"slowest {slowest:.0f} s of CPU time")
-    return 1 if any(count for (_, end), count in table.items() if end == "problems") else 0
+    _print_table(verdicts)
+    return 1 if any(verdict.problems for verdict in verdicts) else 0
 
 
-def _print_table(table: Counter) -> None:
-    """Print how many stages of each form ended how."""
+def _earlier(path: Path) -> list:
+    """Return the verdicts in a file of an interrupted campaign; a line that was begun is dropped from the file."""
+    from .campaign import Verdict  # noqa: PLC0415
+
+    lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
+    if lines and not lines[-1].endswith(b"\n"):
+        path.write_bytes(b"".join(lines := lines[:-1]))
+    return [Verdict(**json.loads(line)) for line in lines]
+
+
+def _print_table(verdicts: list) -> None:
+    """Print how many stages of each form ended how, and the CPU times."""
+    table = Counter()
+    for verdict in verdicts:
+        table[verdict.form, {0: "run", 2: "refused"}.get(verdict.run, "neither")] += 1
+        table[verdict.form, "problems"] += bool(verdict.problems)
     ends, forms = ("run", "refused", "neither", "problems"), [*dict.fromkeys(form for form, _ in table)]
     print(f"{'':10}", *(f"{end:>10}" for end in ends))
     for form in sorted(forms):
         print(f"{form:10}", *(f"{table[form, end]:10}" for end in ends))
     print(f"{'all':10}", *(f"{sum(table[form, end] for form in forms):10}" for end in ends))
+    seconds = sorted((verdict.seconds for verdict in verdicts), reverse=True)
+    longest = ", ".join(f"{longest:.0f}" for longest in seconds[:5])
+    print(f"{len(seconds)} stages, {sum(seconds):.0f} s of CPU time in all, the longest {longest} s")
 
 
 if __name__ == "__main__":

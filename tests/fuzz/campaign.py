@@ -59,7 +59,7 @@ class Verdict:
         run: Exit code of ``warpmag run``.
         line: The one line by which the run was refused.
         problems: What must not happen.
-        seconds: CPU time [s].
+        seconds: CPU time with that of child processes [s].
     """
 
     number: int
@@ -118,14 +118,15 @@ def warm_up(stages: list[Path], command: Callable) -> None:
     """
     with tempfile.TemporaryDirectory() as folder:
         for stage in stages:
-            code, _, said = command("run", str(stage), "--frames", "1", "--device", "cpu", "-o", f"{folder}/out.usda")
+            output = f"{folder}/{stage.stem}.out.usda"
+            code, _, said = command("run", str(stage), "--frames", "1", "--device", "cpu", "-o", output)
             if code != OK:
                 raise RuntimeError(f"{stage}: {said}")
 
 
 def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Callable, device: str = "cpu") -> Verdict:
     """Make a mutant, send it through ``check`` and ``run``, and look at what came of it."""
-    began = time.process_time()
+    began = _cpu_seconds()
     verdict = Verdict(number)
     place = folder / f"{number:05}"
     shutil.rmtree(place, ignore_errors=True)
@@ -156,8 +157,13 @@ def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Ca
         verdict.problems.append(f"failed: {verdict.line}")
     if verdict.run == OK:
         verdict.problems += differences(path, output, simulations[-1] if simulations else None)
-    verdict.seconds = time.process_time() - began
+    verdict.seconds = _cpu_seconds() - began
     return verdict
+
+
+def _cpu_seconds() -> float:
+    """Return the CPU time of this process and of its children that have ended [s]."""
+    return sum(os.times()[:4])
 
 
 @contextlib.contextmanager
@@ -307,7 +313,7 @@ class Campaign:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         command = in_fresh_process if self.fresh else in_process
         for number in numbers:
-            limit = int(time.process_time()) + CPU_SECONDS
+            limit = int(time.process_time()) + CPU_SECONDS  # of this process alone
             resource.setrlimit(resource.RLIMIT_CPU, (limit, resource.RLIM_INFINITY))
             try:
                 verdict = judge(number, self.seed, self.folder, self.sources, command)

@@ -123,7 +123,7 @@ def real_array(name: str, value, *, single: bool = False) -> np.ndarray:
         array = np.asarray(None if isinstance(value, BYTES) else value)
     except Exception as error:  # a ragged list, or an object that fails to become an array
         raise InputError(f"{name}: no array of numbers: {short_repr(value)}") from error
-    if np.ma.is_masked(value):
+    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         raise InputError(f"{name}: has masked entries")
     kind = array.dtype.kind
     if kind == "O" and array.size and all(isinstance(v, numbers.Real) for v in array.flat):

@@ -12,7 +12,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.declarations.checks import check_flag, check_positive, short_repr
+from warpmag.declarations.checks import check_count, check_flag, check_positive, short_repr
 from warpmag.declarations.magnets import MagneticSettings
 from warpmag.deprecation import renamed_arguments
 from warpmag.engine.magnets.attributes import NAMESPACE
@@ -466,13 +466,12 @@ class Simulation:
         """Return the number of frames of a run, by default of the scene.
 
         Raises:
-            InputError: ``frames`` is not a positive whole number.
+            InputError: ``frames`` is not a whole number from 1 to 2³¹ − 1.
         """
         if frames is None:
             frames = self.frame_count if self.frame_count is not None else round(self.frame_rate)
-        if not (isinstance(frames, int) and frames > 0):
-            raise InputError(f"frames: must be a positive whole number, got {frames}")
-        return frames
+        check_count("frames", frames)
+        return int(frames)
 
     def _open_recorder(self, output: str | os.PathLike, copy_scene: bool, frames: int):
         from warpmag.engine.stepping.recording import Recorder  # noqa: PLC0415 - a builder can do without USD
