@@ -239,7 +239,8 @@ def test_maps_that_cannot_be(arguments, text):
 
 
 WILD = {
-    "add_coil": "body shape radius length points closed wire_radius ampere_turns xform label",
+    "add_coil": "body shape radius length points closed wire_radius ampere_turns resistance voltage turns inductance "
+    "xform label",
     "add_field_map": "origin spacing values body factor xform label",
 }
 

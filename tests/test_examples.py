@@ -20,6 +20,7 @@ SMALL = {
     "chain": "--balls 4 --num-frames 40",
     "compass_swarm": "--columns 2 --rows 2 --num-frames 62",
     "connectors": "--num-frames 40",
+    "levitation": "--num-frames 30",
     "sorter": "--coils 2 --num-frames 24",
     "worlds": "--world-count 32 --num-frames 15",
 }

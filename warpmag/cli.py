@@ -159,7 +159,7 @@ def _check(options) -> int:
     print(f"bodies      {bodies} ({kinematic} kinematic), {colliders} colliders")
     print(f"magnets     {len(report.magnets('inducible'))} inducible, {len(report.magnets('permanent'))} permanent")
     sources = [source for group in contents.sources.values() for source in group]
-    currents = sum(source.currents is not None for source in sources)
+    currents = sum(source.drive is not None for source in sources)
     if contents.motions or contents.magnetization_keys or contents.field_keys or currents:
         more = f", {currents} currents" if currents else ""
         more += ", the external field" if contents.field_keys else ""

@@ -26,6 +26,7 @@ from isaaclab_newton.physics import NewtonBuilderCfg, NewtonCfg, NewtonManager
 
 from warpmag.declarations.attributes import NAMESPACE
 from warpmag.declarations.checks import short_repr
+from warpmag.declarations.coils import SourceRecord
 from warpmag.engine.magnets.attributes import mark_shapes
 from warpmag.engine.magnets.declared_magnets import add_inducible, add_permanent
 from warpmag.engine.magnets.declared_sources import add_coil
@@ -89,7 +90,7 @@ class Magnets:
         """Add a coil to bodies of all environments, before they are cloned.
 
         Args:
-            name: Name for :meth:`set_current`.
+            name: Name for :meth:`set_current`, or for :meth:`set_voltage` if the coil has a resistance.
             body: Pattern of paths of bodies; None for a coil that is fixed in the frame of each environment.
             xform: Pose in the frame of the body or environment, a position and a quaternion x y z w.
             coil: Further arguments of :func:`warpmag.add_coil`.
@@ -100,7 +101,8 @@ class Magnets:
         scratch = newton.ModelBuilder()
         register_custom_attributes(scratch)
         shape = add_coil(scratch, xform=xform, **coil)
-        values = {key: scratch.custom_attributes[f"{NAMESPACE}:{key}"].values[shape] for key in ("source", "strength")}
+        attributes = scratch.custom_attributes
+        values = {key: attributes[f"{NAMESPACE}:{key}"].values[shape] for key in ("source", "strength", "voltage")}
         site = self._add_site("add_coil", name, body, scratch.shape_transform[shape])
         if any(site == other for other, _ in self._coils.values()):
             raise InputError(f"add_coil: {short_repr(name)} has the bodies and the pose of another coil")
@@ -139,17 +141,27 @@ class Magnets:
             env_ids: Environments, as a tensor or a sequence of indices; by default all.
 
         Raises:
-            InputError: No coil has the name, or the tensor has another shape.
+            InputError: No coil has the name, it has a voltage, or the tensor has another shape.
         """
-        strengths = wp.to_torch(getattr(self.magnetics.model, NAMESPACE).strength)
-        rows = self._look_up(self._coil_shapes, "set_current", coil)
+        self._set_coil("set_current", coil, ampere_turns, env_ids, driven=False)
+
+    def set_voltage(self, coil: str, voltage: Any, env_ids: Any = None) -> None:
+        """Set the voltage [V] of a coil with a resistance, with the arguments of :meth:`set_current`."""
+        self._set_coil("set_voltage", coil, voltage, env_ids, driven=True)
+
+    def _set_coil(self, function: str, coil: str, value: Any, env_ids: Any, *, driven: bool) -> None:
+        attributes = getattr(self.magnetics.model, NAMESPACE)
+        targets = wp.to_torch(attributes.voltage if driven else attributes.strength)
+        rows = self._look_up(self._coil_shapes, function, coil)
+        if (SourceRecord.from_text(self._coils[coil][1]["source"]).circuit is not None) != driven:
+            raise InputError(f"{function}: {short_repr(coil)} has {'no resistance' if driven else 'a voltage'}")
         rows = rows if env_ids is None else rows[env_ids]
-        values = torch.as_tensor(ampere_turns, dtype=strengths.dtype, device=strengths.device)
+        values = torch.as_tensor(value, dtype=targets.dtype, device=targets.device)
         values = values[:, None] if values.ndim == 1 else values
         if values.ndim and tuple(values.shape) not in (tuple(rows.shape), (len(rows), 1)):
             expected = f"[{len(rows)}] or {list(rows.shape)}"
-            raise InputError(f"set_current: shape must be [], {expected}, got {list(values.shape)}")
-        strengths[rows] = values.expand(rows.shape)
+            raise InputError(f"{function}: shape must be [], {expected}, got {list(values.shape)}")
+        targets[rows] = values.expand(rows.shape)
 
     def readings(self, magnetometer: str) -> torch.Tensor:
         """Return the readings B [T] in the frames of the sensors at the end of the last step, a view.
@@ -208,7 +220,7 @@ class Magnets:
         simulation, model = SimulationContext.instance(), NewtonManager.get_model()
         self._place_coils(model)
         step = simulation.cfg.dt / simulation.cfg.physics.num_substeps
-        self._magnetics = Magnetics(model, **{"step": step, **self._settings})
+        self._step, self._magnetics = step, Magnetics(model, **{"dt": step, **self._settings})
         for name, (site, options) in self._sensors.items():
             sites = self._shapes_of(model, name, site).ravel().tolist()
             self._magnetometers[name] = SensorMagnetometer(model, self._magnetics, sites, **options)
@@ -219,12 +231,14 @@ class Magnets:
     def _place_coils(self, model: newton.Model) -> None:
         """Make coils of the sites that Isaac Lab has cloned."""
         attributes = getattr(model, NAMESPACE)
-        strengths = attributes.strength.numpy()
+        strengths, voltages = attributes.strength.numpy(), attributes.voltage.numpy()
         shapes = {name: self._shapes_of(model, name, site) for name, (site, _) in self._coils.items()}
         for name, (_, values) in self._coils.items():
             for shape in shapes[name].ravel().tolist():
                 attributes.source[shape], strengths[shape] = values["source"], values["strength"]
+                voltages[shape] = values["voltage"]
         attributes.strength.assign(strengths)
+        attributes.voltage.assign(voltages)
         device = wp.device_to_torch(model.device)
         self._coil_shapes = {name: torch.from_numpy(rows).to(device) for name, rows in shapes.items()}
 
@@ -238,7 +252,7 @@ class Magnets:
         return np.array(shapes)[np.argsort(worlds, kind="stable")][-counts.sum() :].reshape(len(counts), -1)
 
     def _apply(self, state: newton.State) -> None:
-        self.magnetics.apply(state)
+        self.magnetics.apply(state, self._step)
 
     def _measure(self) -> None:
         state = NewtonManager.get_state_0()

@@ -15,6 +15,7 @@ from the same fields, so that forces are opposite and equal. Without sources non
 |---|---|
 | sources | records of sources, and the arrays of sources and targets on a device |
 | fields | launches: fields at targets and about balls, forces, reactions |
+| circuits | coils with voltages: time steps of their currents |
 | solids | tables of permanent bodies and of the polyhedra that bound them |
 | near_cells | cells near permanent bodies: averages of the field, charges on their faces |
 | expansion | points and tables for the expansion of a field about a ball |
@@ -25,6 +26,7 @@ from the same fields, so that forces are opposite and equal. Without sources non
 | `balls.h` | expansion of fields about balls |
 | `sources.h` | kinds of coils and maps, and their frames |
 | `point_field.h` | field and gradient at one point, in double precision; the inside of a wire |
+| `circuits.h` | field of one ampere-turn at moments |
 | `loop.h`, `solenoid.h` | circular loop; cylindrical sheet of current |
 | `polyline.h` | chain of straight pieces of wire |
 | `field_map.h` | field on a regular grid |

@@ -57,7 +57,14 @@ def new_world(balls: int = 2) -> dict[str, Any]:
     return {
         **{"builder": builder, "scene": builder, "model": model, "state": state, "magnetics": magnetics},
         **{"viewer": viewer, "control": model.control(), "positions": POINTS, "points": POINTS, "body": 0},
-        **{"sites": "site", "coil": coil, "ampere_turns": 2.0, "external_field": (0.0, 0.0, 1e4), "count": 2},
+        **{
+            "sites": "site",
+            "coil": coil,
+            "ampere_turns": 2.0,
+            "voltage": 2.0,
+            "external_field": (0.0, 0.0, 1e4),
+            "count": 2,
+        },
         **{"magnetization": M, "magnetizations": {1: M}, "material": "iron", "time": 0.0, "frames": 1, "radius": 0.005},
         **{"origin": (0.0, 0.0, 0.0), "spacing": 0.01, "values": np.ones((3, 3, 3, 3)), "name": "iron"},
         **{"fields": [0.0, 1e3, 1e5], "flux_densities": [0.0, 1.0, 1.5], "path": os.devnull, "output": None},
@@ -88,7 +95,7 @@ FUNCTIONS = (
 CURVES = ("from_bh", "from_mh", "from_csv")
 USUAL = ("body", "magnetization", "saturation", "radius", "device", "dtype")
 """Optional arguments that are given in most calls, as users do."""
-PASSIVE = {"persistent_arrays", "warnings", "frame", "allow_restart", "stay"}
+PASSIVE = {"persistent_arrays", "stepped_arrays", "warnings", "frame", "allow_restart", "stay"}
 """Methods without arguments that return no numbers, or only when a viewer is closed."""
 
 

@@ -9,7 +9,7 @@ import base64
 import json
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,9 @@ from warpmag.errors import InputError
 
 COIL_SHAPES = ("loop", "solenoid", "polyline")
 LARGEST_STRENGTH = 1e15
-"""Largest ampere-turns [A], and largest factor of a field map: fields stay within single precision."""
+"""Largest ampere-turns [A] and voltage [V], and largest factor of a field map: they stay within single precision."""
+CIRCUIT_RANGE = (1e-12, 1e12)
+"""Smallest and largest resistance [Ω], inductance [H] and number of turns."""
 DEFAULT_WIRE_RADIUS = 0.01
 """Default radius of a wire, in radii of the coil, or in diagonals of the box around a polyline."""
 SIZE_RANGE = (1e-7, 1e6)
@@ -28,6 +30,7 @@ LARGEST_POINT = 1e7
 """Largest coordinate [m] of a point of a coil or of a map."""
 STRONGEST_FIELD = 1e30
 """Largest component [A/m] of the field of a map."""
+_CIRCUIT_TEXT = f"0 or [{CIRCUIT_RANGE[0]:g}, {CIRCUIT_RANGE[1]:g}]"
 _SIZE_TEXT = f"[{SIZE_RANGE[0]:g}, {SIZE_RANGE[1]:g}] m"
 
 Vector = tuple[float, float, float]
@@ -45,6 +48,13 @@ def check_size(name: str, value: Any) -> None:
     check_positive(name, value)
     if not SIZE_RANGE[0] <= (size := real_number(name, value)) <= SIZE_RANGE[1]:
         raise InputError(f"{name}: must be from {SIZE_RANGE[0]:g} to {SIZE_RANGE[1]:g} m, got {size:g}")
+
+
+def check_circuit_value(name: str, value: Any) -> None:
+    """Raise :class:`InputError` unless ``value`` is 0 or within :data:`CIRCUIT_RANGE`."""
+    number = real_number(name, value)
+    if number != 0.0 and not CIRCUIT_RANGE[0] <= number <= CIRCUIT_RANGE[1]:
+        raise InputError(f"{name}: must be {_CIRCUIT_TEXT}, got {number:g}")
 
 
 def check_spacing(name: str, value: Any) -> None:
@@ -68,6 +78,14 @@ def checked_vectors(name: str, values: Any, most: float) -> np.ndarray:
     return array.astype(float)
 
 
+class Circuit(NamedTuple):
+    """Winding of a coil with a voltage."""
+
+    turns: float  # number of turns
+    resistance: float  # of the winding and its supply [Ω]
+    inductance: float  # in air [H]; 0 means that of the coil's geometry
+
+
 @dataclass(frozen=True, eq=False)
 class SourceRecord:
     """Data of one source for the kernels, in the frame of the source."""
@@ -75,25 +93,29 @@ class SourceRecord:
     kind: str  # name of a ``kernels.applied.sources.SourceKind``, in lower case
     parameters: tuple[float, ...]  # numbers of the kind
     table: np.ndarray  # vectors of the kind, shape [k, 3]
+    circuit: Circuit | None = None  # of a coil with a voltage, None where the current is given
 
     def to_text(self) -> str:
         """Return the record as a line of text that keeps every bit of its numbers."""
         table = base64.b64encode(np.ascontiguousarray(self.table, "<f8").tobytes()).decode("ascii")
-        return json.dumps({"kind": self.kind, "parameters": self.parameters, "table": table})
+        fields = {"kind": self.kind, "parameters": self.parameters, "table": table}
+        return json.dumps(fields if self.circuit is None else fields | {"circuit": self.circuit})
 
     @classmethod
     def from_text(cls, text: str) -> "SourceRecord":
         """Return the record of a line that :meth:`to_text` wrote."""
         fields = json.loads(text)
         table = np.frombuffer(base64.b64decode(fields["table"]), "<f8").reshape(-1, 3)
-        return cls(fields["kind"], tuple(fields["parameters"]), table)
+        circuit = Circuit(*fields["circuit"]) if "circuit" in fields else None
+        return cls(fields["kind"], tuple(fields["parameters"]), table, circuit)
 
 
 @dataclass(frozen=True)
 class Coil:
     """A coil in its own frame; each field is a row of the table of attributes.
 
-    Loops and solenoids are about the z axis. A positive current makes a field along z inside them.
+    Loops and solenoids are about the z axis. A positive current makes a field along z inside them. A coil with a
+    resistance has a voltage, and its current follows. The current of other coils is given.
     """
 
     shape: Annotated[str, Attribute(
@@ -127,8 +149,27 @@ class Coil:
     )] = 0.0  # fmt: skip
     ampere_turns: Annotated[float, Attribute(
         "coil:ampereTurns", "float", "Ampere-Turns",
-        "Current times turns; a positive current makes a field along z inside a loop or a solenoid.",
+        "Current times turns; a positive current makes a field along z inside a loop or a solenoid. With a resistance "
+        "it is the current at the start.",
         unit="ampere", range=f"[-{LARGEST_STRENGTH:g}, {LARGEST_STRENGTH:g}]", check=check_strength,
+    )] = 0.0  # fmt: skip
+    resistance: Annotated[float, Attribute(
+        "coil:resistance", "float", "Resistance",
+        "Resistance of the winding and its supply. The current then follows from the voltage; with 0 it is given.",
+        unit="ohm", range=_CIRCUIT_TEXT, check=check_circuit_value, uniform=True,
+    )] = 0.0  # fmt: skip
+    voltage: Annotated[float, Attribute(
+        "coil:voltage", "float", "Voltage", "Voltage at a coil with a resistance; 0 is a short circuit.",
+        unit="volt", range=f"[-{LARGEST_STRENGTH:g}, {LARGEST_STRENGTH:g}]", check=check_strength,
+    )] = 0.0  # fmt: skip
+    turns: Annotated[float, Attribute(
+        "coil:turns", "float", "Turns", "Number of turns of a coil with a resistance.",
+        unit="dimensionless", range=_CIRCUIT_TEXT, check=check_circuit_value, uniform=True,
+    )] = 1.0  # fmt: skip
+    inductance: Annotated[float, Attribute(
+        "coil:inductance", "float", "Inductance",
+        "Inductance in air of a coil with a resistance, as measured; 0 means that of its geometry.",
+        unit="henry", range=_CIRCUIT_TEXT, check=check_circuit_value, uniform=True,
     )] = 0.0  # fmt: skip
 
     def __post_init__(self):
@@ -152,6 +193,18 @@ class Coil:
         wire = real_number(f"{name}: wire radius", self.wire_radius)
         if not 0.0 <= wire <= most:
             raise InputError(f"{name}: wire radius must be from 0 to {most:g}, got {wire:g}")
+        self._check_circuit(name)
+
+    def _check_circuit(self, name: str) -> None:
+        check_fields(self, name, "resistance", "voltage", "turns", "inductance")
+        if self.resistance == 0.0:
+            for field, default in (("voltage", 0.0), ("turns", 1.0), ("inductance", 0.0)):
+                if getattr(self, field) != default:
+                    raise InputError(f"{name}: {field} is given, but only a coil with a resistance has one")
+        elif self.turns == 0.0:
+            raise InputError(f"{name}: turns: must be positive, got 0")
+        elif self.shape == "polyline" and not self.closed:
+            raise InputError(f"{name}: resistance is given, but an open polyline is only a part of a circuit")
 
     def _check_points(self, name: str) -> None:
         least = 3 if self.closed else 2
@@ -180,12 +233,16 @@ class Coil:
 
     def record(self) -> SourceRecord:
         """Return the coil as a source of one ampere-turn."""
+        circuit = None
+        if self.resistance:
+            circuit = Circuit(float(self.turns), float(self.resistance), float(self.inductance))
         if self.shape == "polyline":
             wire = self.wire_radius or DEFAULT_WIRE_RADIUS * self._diagonal()
-            return SourceRecord(self.shape, (float(wire),), self._path())
+            return SourceRecord(self.shape, (float(wire),), self._path(), circuit)
         wire = self.wire_radius or min(DEFAULT_WIRE_RADIUS * self.radius, self._largest_wire_radius())
         half_length = (0.5 * float(self.length),) if self.shape == "solenoid" else ()
-        return SourceRecord(self.shape, (float(self.radius), *half_length, float(wire)), np.zeros((0, 3)))
+        parameters = (float(self.radius), *half_length, float(wire))
+        return SourceRecord(self.shape, parameters, np.zeros((0, 3)), circuit)
 
 
 @dataclass(frozen=True, eq=False)

@@ -65,4 +65,5 @@ class SceneKeys:
     motions: dict[int, Motion]  # of kinematic bodies, by body
     magnetizations: dict[int, Keys]  # of permanent magnets [A/m], in the frames of their shapes, by shape
     currents: dict[int, Keys]  # ampere-turns of coils [A], by shape
+    voltages: dict[int, Keys]  # of coils with a resistance [V], by shape
     field: Keys | None = None  # external field [A/m], None where it is constant

@@ -28,7 +28,8 @@ _TYPES = {"token": wp.int32, "float": wp.float32, "vector3f": wp.vec3}
 _SOURCE_ATTRIBUTES = {
     "source": (str, ""),  # text of a ``declarations.coils.SourceRecord``; empty on a shape that is not a source
     "strength": (wp.float32, 0.0),
-    "current_keys": (str, ""),  # text of the ``Keys`` of a coil's current; empty where it is constant
+    "voltage": (wp.float32, 0.0),  # [V], of a coil with a resistance
+    "current_keys": (str, ""),  # text of the ``Keys`` of a coil's current or voltage; empty where it is constant
 }
 """Warp type and default of the attributes of sources."""
 _measured_curves: dict[MagnetizationCurve, int] = {}

@@ -13,7 +13,7 @@ import warp as wp
 
 from warpmag.declarations.attributes import NAMESPACE
 from warpmag.declarations.checks import check_text, check_whole, plain_value, short_repr
-from warpmag.declarations.coils import LARGEST_POINT, Coil, FieldMap, SourceRecord, checked_vectors
+from warpmag.declarations.coils import LARGEST_POINT, Coil, FieldMap, checked_vectors
 from warpmag.deprecation import keyword_arguments
 from warpmag.engine.magnets.attributes import check_registered
 from warpmag.engine.magnets.selection import selected
@@ -36,6 +36,10 @@ def add_coil(
     closed: bool = True,
     wire_radius: float = 0.0,
     ampere_turns: float = 0.0,
+    resistance: float = 0.0,
+    voltage: float = 0.0,
+    turns: float = 1.0,
+    inductance: float = 0.0,
     xform: wp.transform | tuple | None = None,
     label: str | None = None,
 ) -> int:
@@ -56,7 +60,14 @@ def add_coil(
         wire_radius: Radius of the wire [m]; for a solenoid, radius of the rounded edges of its current sheet. 0 means
             1 % of the coil's radius, or of the diagonal of a polyline's bounding box.
         ampere_turns: Current times turns [A], all turns of a solenoid; :meth:`warpmag.Magnetics.set_current` changes
-            it.
+            it. For a coil with a resistance, the value at the start.
+        resistance: Resistance of the winding and its supply [Ω]. The current then follows from the voltage and from the
+            flux of iron, magnets and coils. By default the current is given.
+        voltage: Voltage [V] at a coil with a resistance; :meth:`warpmag.Magnetics.set_voltage` changes it. 0 is a
+            short circuit.
+        turns: Number of turns of a coil with a resistance.
+        inductance: Inductance of a coil with a resistance, in air [H]. By default that of its geometry: all turns in
+            the wire of a loop or a polyline, or in the sheet of a solenoid.
         xform: Pose of the coil in the frame of the body, or in the world.
         label: Label of the coil, by which :meth:`warpmag.Magnetics.set_current` finds it.
 
@@ -69,9 +80,12 @@ def add_coil(
     corners = ()
     if points is not None:
         corners = checked_vectors("add_coil: points", host_array("add_coil: points", points), LARGEST_POINT)
-    coil = Coil(shape, radius, length, tuple(map(tuple, corners)), closed, wire_radius, ampere_turns)
+    coil = Coil(
+        shape, radius, length, tuple(map(tuple, corners)), closed, wire_radius, ampere_turns,
+        resistance, voltage, turns, inductance,
+    )  # fmt: skip
     coil.check("add_coil")
-    return _add_source(builder, body, coil.record(), coil.ampere_turns, xform, "coil", label)
+    return _add_source(builder, body, coil, xform, "coil", label)
 
 
 @keyword_arguments("origin", "spacing", "values")
@@ -114,7 +128,7 @@ def add_field_map(
     steps = np.resize(steps, 3) if steps.ndim == 0 else steps
     field_map = FieldMap(tuple(np.atleast_1d(first)), tuple(steps), nodes, factor)
     field_map.check(name)
-    return _add_source(builder, body, field_map.record(), field_map.factor, xform, "field_map", label)
+    return _add_source(builder, body, field_map, xform, "field_map", label)
 
 
 def add_placed_source(
@@ -129,18 +143,15 @@ def add_placed_source(
         frame: Frame of the source in the world.
         current_keys: Keys of its current as text, for :class:`KeyedCurrents`; empty if they are set elsewhere.
     """
-    source = placed.source
-    strength = source.ampere_turns if isinstance(source, Coil) else source.factor
     if body >= 0:
         frame = wp.transform_inverse(wp.transform(*builder.body_q[body])) * frame
-    return _add_source(builder, body, source.record(), strength, frame, "", placed.prim, current_keys)
+    return _add_source(builder, body, placed.source, frame, "", placed.prim, current_keys)
 
 
 def _add_source(
     builder: newton.ModelBuilder,
     body: int | str,
-    record: SourceRecord,
-    strength: float,
+    source: Coil | FieldMap,
     xform,
     kind: str,
     label,
@@ -154,8 +165,12 @@ def _add_source(
     number = -1 if body == -1 else _single_body(builder, body)
     check_text("label", label)
     frame = wp.transform() if xform is None else _checked_frame("xform", xform)
-    values = {f"{NAMESPACE}:source": record.to_text(), f"{NAMESPACE}:strength": float(strength)}
-    values[f"{NAMESPACE}:current_keys"] = keys
+    values = {"source": source.record().to_text(), "current_keys": keys}
+    if isinstance(source, Coil):
+        values |= {"strength": float(source.ampere_turns), "voltage": float(source.voltage)}
+    else:
+        values["strength"] = float(source.factor)
+    values = {f"{NAMESPACE}:{attribute}": value for attribute, value in values.items()}
     return builder.add_site(number, xform=frame, label=label, custom_attributes=values)
 
 

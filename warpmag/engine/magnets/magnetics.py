@@ -70,6 +70,7 @@ class Magnetics:
         shapes: Indices of the magnetic shapes, in the order of :meth:`shape_moments`, shape [n].
         shape_volumes: Magnetic volume of each of these shapes [m³], shape [n]. Where shapes of one body overlap, the
             common volume belongs to the first of them.
+        coils: The coils with voltages, None without any: their ``labels``, and on the device their ``currents`` [A].
     """
 
     @renamed_arguments(step="dt")
@@ -136,6 +137,7 @@ class Magnetics:
             wp.array(bodies, dtype=wp.int32, device=model.device) for bodies in (coupled_bodies, solid_bodies)
         )
         self._sources.bind(self.system)
+        self.coils = self._sources.circuits
         self._map_bodies()
         self._prepare_reset()
         set_conductivities(model, self.magnets, self.system, float(dt))
@@ -255,16 +257,17 @@ class Magnetics:
         self._initial_values = [
             WorldRows(attributes.magnetization, shape_worlds),
             WorldRows(attributes.strength, shape_worlds),
+            WorldRows(attributes.voltage, shape_worlds),
             WorldRows(self.external_field, self._worlds[self.system.worlds]),
         ]
 
     def reset(self, worlds: Any = None) -> None:
         """Start worlds again, as after :class:`Magnetics` was made; capturable in a graph with an array on the device.
 
-        Their next induction starts from zero magnetization. Their coil currents, factors of field maps, magnetizations
-        and external fields return to the values from which this object was made; set others afterwards. The state with
-        the poses, changed materials and the other worlds stay. Neighbor lists of touching magnets are rebuilt in all
-        worlds, which may change later results of the others within ``rtol``::
+        Their next induction starts from zero magnetization. Their coil currents and voltages, factors of field maps,
+        magnetizations and external fields return to the values from which this object was made; set others afterwards.
+        The state with the poses, changed materials and the other worlds stay. Neighbor lists of touching magnets are
+        rebuilt in all worlds, which may change later results of the others within ``rtol``::
 
             done = wp.array([True, False, False], dtype=wp.bool)  # or a tensor of torch
             magnetics.reset(worlds=done)
@@ -280,10 +283,12 @@ class Magnetics:
         self._mask.set(worlds)
         for rows in self._initial_values:
             rows.restore(self._mask)
+        if self.coils is not None:
+            self.coils.reset(self._mask)
         choose(self._mask.array, self._system_worlds, self._chosen_worlds)
         self.system.start_cold(self._chosen_worlds)
 
-    def apply(self, state: newton.State) -> None:
+    def apply(self, state: newton.State, dt: float | None = None) -> None:
         """Add the magnetic forces at the poses of ``state`` to ``state.body_f``; capturable in a graph.
 
         On an active ``wp.Tape`` the forces are differentiated by poses, if ``state.body_q`` requires a gradient.
@@ -291,26 +296,41 @@ class Magnetics:
         Args:
             state: State with poses ``body_q``. Forces are added to ``body_f``, which is not cleared. Conducting magnets
                 also need velocities, ``body_qd``.
+            dt: Time for which the forces act [s], the time step of the solver. The currents of coils with voltages
+                advance by it; a model with such coils needs it.
 
         Raises:
             InputError: ``model.warpmag`` has changed, see :meth:`notify_model_changed`; with a GPU some calls later.
-                Or a ``wp.Tape`` is active, ``body_q`` requires a gradient, and the forces have none.
+                Or a ``wp.Tape`` is active, ``body_q`` requires a gradient, and the forces have none. Or ``dt`` is
+                missing or not positive.
 
         Warns:
             ConvergenceWarning: ``max_evaluations`` did not reach ``rtol``. With a GPU only methods that return arrays
                 to the host warn, because this one does not wait; see :attr:`converged`.
         """
+        if dt is None and self.coils is not None:
+            raise InputError(f"apply: dt is missing, by which the current of {self.coils.labels[0]} advances")
         with paused_tape() as tape:
-            self.induce(state)
+            if tape is not None and self.coils is not None and state.body_q.requires_grad:
+                raise InputError(f"apply: forces with the voltage of {self.coils.labels[0]} have no gradient")
+            self.induce(state, dt)
             self.add_forces(state)
             if tape is not None:
                 record_forces(tape, self.system, self._body_moments, self._model, state)
         if self.device.is_cpu and not self.device.is_capturing:
             self._warn_unconverged(level=3)
 
-    def induce(self, state: newton.State) -> None:
-        """Solve the induction at the poses of ``state``, starting from the last magnetizations."""
+    def induce(self, state: newton.State, dt: float | None = None, *, sharing: wp.array | None = None) -> None:
+        """Solve the induction at the poses of ``state``, starting from the last magnetizations.
+
+        Args:
+            state: State with poses ``body_q``.
+            dt: Time [s] by which the currents of coils with voltages advance; by default they stay.
+            sharing: Factor of ``dt`` on the device, int32, shape [1]: the larger one of this number and 2.
+        """
         values, system = self._values, self.system
+        if dt is not None:
+            check_positive("dt", dt)
         self._check_state(state, "body_q")
         check_untaped({"state.body_q": state.body_q}, "only Magnetics.apply records one")
         self._induced = True
@@ -327,7 +347,10 @@ class Magnetics:
         if len(self._recoiling):
             gather_bias(state.body_q, self._body_moments, self._recoiling, self._bias_factors, system.bias)
         gather_velocities(self._model, state, self._body_moments, self._sources, system)
-        system.solve()
+        if self.coils is None or dt is None:
+            system.solve()
+        else:
+            self.coils.step(float(dt), sharing)
 
     def add_forces(self, state: newton.State) -> None:
         """Add the forces on the present moments to ``state.body_f``: the second half of :meth:`apply`."""
@@ -372,7 +395,13 @@ class Magnetics:
         attributes, system = getattr(self._model, NAMESPACE), self.system
         values = {"magnetization": attributes.magnetization, "strength": attributes.strength}
         values["field"] = system.external_field
+        if self.coils is not None:
+            values |= {f"coils.{name}": array for name, array in self.coils.persistent_arrays().items()}
         return values | self._values.persistent_arrays() | system.persistent_arrays()
+
+    def stepped_arrays(self) -> list[wp.array]:
+        """Return the arrays that advance by ``dt`` in :meth:`induce`; restoring them repeats the step."""
+        return [] if self.coils is None else self.coils.stepped_arrays()
 
     def check_model(self) -> None:
         """Raise :class:`InputError` if ``model.warpmag`` was changed without a notification; waits for the device."""
@@ -405,9 +434,27 @@ class Magnetics:
                 model's device; its values are not checked.
 
         Raises:
-            InputError: No coil matches, the numbers of values and coils differ, or a value is not finite.
+            InputError: No coil matches, the numbers of values and coils differ, or a value is not finite. Or a coil has
+                a voltage, see :meth:`set_voltage`.
         """
         self._sources.set_strength("set_current", coil, ampere_turns)
+
+    def set_voltage(self, coil: int | str, voltage: Numbers) -> None:
+        """Set the voltage of coils with a resistance. After a first call capturable in a graph with a Warp array.
+
+        The values are written to ``model.warpmag.voltage``, where a program may write as well. Read the currents from
+        ``coils.currents``.
+
+        Args:
+            coil: Index of the coil's shape or a pattern of labels, as in :meth:`set_current`.
+            voltage: Voltage [V], one number or shape [coils]. Or a Warp array of float32 on the model's device; its
+                values are not checked.
+
+        Raises:
+            InputError: No coil matches, one has no resistance, the numbers of values and coils differ, or a value is
+                not finite.
+        """
+        self._sources.set_voltage("set_voltage", coil, voltage)
 
     def set_magnetization(self, magnetization: Numbers, *, body: int = -1, shape: int | None = None) -> None:
         """Set the magnetization of a permanent magnet. Capturable in a graph with a Warp array.

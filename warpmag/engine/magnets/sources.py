@@ -10,6 +10,7 @@ import warp as wp
 from warpmag.declarations.attributes import NAMESPACE
 from warpmag.declarations.checks import check_whole, short_repr
 from warpmag.declarations.coils import SourceRecord, check_strength
+from warpmag.engine.magnets.circuits import CoilCircuits
 from warpmag.engine.magnets.magnet_system import KINEMATIC
 from warpmag.errors import InputError
 from warpmag.kernels.applied.sources import AppliedSource, SourceKind
@@ -30,13 +31,14 @@ class ModelSources:
     Attributes:
         shapes: Shapes that represent sources, in the order of ``applied``.
         applied: The sources as a :class:`MomentSystem` takes them.
+        circuits: Coils with voltages, None without any; set by :meth:`bind`.
     """
 
     def __init__(self, model: newton.Model, magnet_worlds: np.ndarray):
         """Read the sources from the attributes of the model; ``magnet_worlds`` are the worlds of ``find_magnets``."""
         self._model, self._matches = model, {}
         texts = getattr(getattr(model, NAMESPACE, None), "source", ())
-        self.shapes, self.applied = [], []
+        self.shapes, self.applied, self._records = [], [], []
         bodies, worlds, flags = model.shape_body.numpy(), model.shape_world.numpy(), model.body_flags
         records: dict[str, SourceRecord] = {}
         for shape in [shape for shape, text in enumerate(texts) if text]:
@@ -48,6 +50,7 @@ class ModelSources:
             movable = body >= 0 and not flags.numpy()[body] & KINEMATIC
             kind = SourceKind[record.kind.upper()]
             self.shapes.append(shape)
+            self._records.append(record)
             self.applied.append(AppliedSource(kind, record.parameters, record.table, world, body, movable))
 
     def bind(self, system: MomentSystem) -> None:
@@ -66,6 +69,8 @@ class ModelSources:
         shapes.body_list, shapes.run_start = on_device(bodies), on_device([*starts, len(movable)])
         shapes.order = on_device([index for _, index in movable])
         shapes.kinematic_flag = KINEMATIC
+        self._driven = {shape for shape, record in zip(self.shapes, self._records, strict=True) if record.circuit}
+        self.circuits = CoilCircuits(model, self.shapes, self._records, system) if self._driven else None
 
     def gather(self, body_q) -> None:
         """Write the frames and the strengths of the sources to the system."""
@@ -87,36 +92,53 @@ class ModelSources:
         """Set the strengths of the sources that match a shape index or a shell pattern of labels.
 
         ``value`` is one strength for all of them, or one for each, in the order of their shapes. Messages begin with
-        ``name``.
+        ``name``. Coils with voltages raise :class:`InputError`.
         """
-        if not isinstance(selector, str):
-            check_whole(name, selector)
-        if selector not in self._matches:
-            self._matches[selector] = self._matching(name, selector)
-        shapes = self._matches[selector]
+        shapes = self._matching(name, selector, driven=False)
+        set_strengths(self._numbers(name, value, len(shapes)), shapes, self._shapes.strengths)
+
+    def set_voltage(self, name: str, selector: int | str, value) -> None:
+        """Set the voltages of coils, as :meth:`set_strength` sets strengths; other sources raise InputError."""
+        shapes = self._matching(name, selector, driven=True)
+        set_strengths(self._numbers(name, value, len(shapes)), shapes, getattr(self._model, NAMESPACE).voltage)
+
+    def _numbers(self, name: str, value, count: int) -> wp.array:
+        """Return one number or ``count`` on the device."""
         if isinstance(value, wp.array):
             check_warp_array(name, value, wp.float32, self._model.device)
             values = value
         else:
             numbers = np.atleast_1d(host_array(name, value))
-            for strength in numbers.flat:
-                check_strength(name, strength)
+            for number in numbers.flat:
+                check_strength(name, number)
             if numbers.ndim != 1:
-                raise InputError(f"{name}: shape must be [] or [{len(shapes)}], got {list(numbers.shape)}")
+                raise InputError(f"{name}: shape must be [] or [{count}], got {list(numbers.shape)}")
             values = wp.array(numbers, dtype=wp.float32, device=self._model.device)
-        if len(values) not in (1, len(shapes)):
-            raise InputError(f"{name}: must be 1 or {len(shapes)} numbers, one for each source, got {len(values)}")
-        set_strengths(values, shapes, self._shapes.strengths)
+        if len(values) not in (1, count):
+            raise InputError(f"{name}: must be 1 or {count} numbers, one for each source, got {len(values)}")
+        return values
 
-    def _matching(self, name: str, selector: int | str) -> wp.array:
-        """Return the shapes of the matching sources, on the device."""
+    def _matching(self, name: str, selector: int | str, *, driven: bool) -> wp.array:
+        """Return the shapes of the matching sources, on the device; all must have voltages if ``driven``, else none."""
+        if not isinstance(selector, str):
+            check_whole(name, selector)
+        if (selector, driven) not in self._matches:
+            self._matches[selector, driven] = self._find(name, selector, driven)
+        return self._matches[selector, driven]
+
+    def _find(self, name: str, selector: int | str, driven: bool) -> wp.array:
+        labels = self._model.shape_label
         if isinstance(selector, str):
             matches = re.compile(fnmatch.translate(selector)).match
-            shapes = [shape for shape in self.shapes if matches(self._model.shape_label[shape])]
+            shapes = [shape for shape in self.shapes if matches(labels[shape])]
         else:
             shapes = [shape for shape in self.shapes if shape == selector]
         if not shapes:
             raise InputError(f"{name}: {short_repr(selector)} is no source of the model")
+        for shape in shapes:
+            if (shape in self._driven) != driven:
+                problem = "has no resistance, so its current is given" if driven else "has a voltage, which sets it"
+                raise InputError(f"{name}: {labels[shape]} {problem}")
         return wp.array(shapes, dtype=wp.int32, device=self._model.device)
 
 

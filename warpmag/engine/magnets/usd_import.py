@@ -89,6 +89,6 @@ def _add_sources(prim: Any, context: dict[str, Any]) -> Iterable[dict[str, Any]]
             pose = pose * imported["path_body_relative_transform"].get(anchor, wp.transform_identity())
             stage = pose * wp.transform_inverse(_transform(world_matrix_at(prim, anchor)))
         frame = stage * wp.transform(source.position, source.rotation)
-        keys = "" if source.currents is None else source.currents.to_text()
+        keys = "" if source.drive is None else source.drive.to_text()
         add_placed_source(builder, source, -1 if source.body is None else bodies[source.body], frame, keys)
     return []

@@ -53,7 +53,7 @@ def builder_scene(
         magnets=StageMagnets({paths[shape]: magnet for shape, magnet in magnets.items()}, settings),
         bodies=dict(zip(made.bodies, range(model.body_count), strict=True)),
         magnet_shapes={paths[shape]: [shape] for shape in magnets},
-        keys=SceneKeys({}, {}, {}),
+        keys=SceneKeys({}, {}, {}, {}),
         warnings=(),
     )
 

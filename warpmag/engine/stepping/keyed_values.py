@@ -1,4 +1,5 @@
-"""Sets keyed values of a model: poses of kinematic bodies, magnetizations, currents, the external field.
+"""Sets keyed values of a model: poses of kinematic bodies, magnetizations, currents, voltages, the
+external field.
 
 Keys are interpolated at a time stored on the device, so that repeated and shortened substeps read the right values.
 """
@@ -8,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.declarations.checks import short_repr
+from warpmag.declarations.coils import SourceRecord
 from warpmag.declarations.keys import Keys, SceneKeys
 from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.caller_checks import held_by_model
@@ -36,9 +38,10 @@ class KeyedModelValues:
             operations = {body: motion.operations for body, motion in keys.motions.items()}
             self._bodies = keyed_poses(operations, _free_joints(model, list(operations)), model, self.time)
         attributes = getattr(model, NAMESPACE)
-        curves = [*keys.magnetizations.values(), *keys.currents.values()]
+        curves = [*keys.magnetizations.values(), *keys.currents.values(), *keys.voltages.values()]
         targets = [attributes.magnetization[shape : shape + 1] for shape in keys.magnetizations]
         targets += [attributes.strength[shape : shape + 1] for shape in keys.currents]
+        targets += [attributes.voltage[shape : shape + 1] for shape in keys.voltages]
         self._field = None
         if keys.field is not None:
             self._field = wp.zeros(1, dtype=wp.vec3, device=model.device)
@@ -46,7 +49,7 @@ class KeyedModelValues:
         self._keyed = keyed_arrays(curves, targets, self.time) if curves else None
 
     def set_values(self, offset: float, *, shared: wp.array | None = None, substep: float = 0.0) -> None:
-        """Set magnetizations, currents and the field to their values ``offset`` [s] after :attr:`time`.
+        """Set magnetizations, currents, voltages and the field to their values ``offset`` [s] after :attr:`time`.
 
         ``shared`` is the number of substeps of ``substep`` [s] that share these values (``kernels.rigid.keys``).
         """
@@ -72,7 +75,9 @@ class KeyedModelValues:
 class KeyedCurrents:
     """Time-sampled currents of coils that ``builder.add_usd`` imported, for programs with a loop of their own.
 
-    ``Simulation`` sets all keyed values of a stage itself. ``KeyedCurrents`` sets currents only: ``add_usd`` imports
+    Coils with a resistance have time-sampled voltages in place of currents.
+
+    ``Simulation`` sets all keyed values of a stage itself. ``KeyedCurrents`` sets coils only: ``add_usd`` imports
     motions and magnetizations at the start of the stage, without keys. Replicated worlds share keys::
 
         currents = warpmag.KeyedCurrents(model)
@@ -98,11 +103,13 @@ class KeyedCurrents:
         keys = {shape: Keys.from_text(text) for shape, text in enumerate(texts) if text}
         if not keys:
             raise InputError("KeyedCurrents: no coil of the model has a current with time samples")
-        self.shapes, strength = tuple(keys), getattr(model, NAMESPACE).strength
+        self.shapes, attributes = tuple(keys), getattr(model, NAMESPACE)
         self.time = wp.zeros(1, dtype=wp.float64, device=model.device)
-        self._keyed = keyed_arrays(
-            list(keys.values()), [strength[shape : shape + 1] for shape in self.shapes], self.time
-        )
+        targets = []
+        for shape in self.shapes:
+            driven = SourceRecord.from_text(attributes.source[shape]).circuit is not None
+            targets.append((attributes.voltage if driven else attributes.strength)[shape : shape + 1])
+        self._keyed = keyed_arrays(list(keys.values()), targets, self.time)
         self.set()
 
     def set(self, time: float | None = None) -> None:

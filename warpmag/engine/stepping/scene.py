@@ -115,9 +115,9 @@ def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, art
     for joint in grounded:
         _correct_grounded_joint(builder, joint, joints[joint.path], bodies[joint.moving], shapes)
     shapes_of_magnets = _mark_magnets(builder, stage, contents.magnets, bodies, shapes)
-    currents = _add_sources(builder, contents.sources, bodies)
+    drives = _add_sources(builder, contents.sources, bodies)
     magnets = StageMagnets(contents.magnets, contents.settings, contents.initial_moments)
-    keys = _scene_keys(builder, stage, contents, clock, bodies, shapes_of_magnets, currents)
+    keys = _scene_keys(builder, stage, contents, clock, bodies, shapes_of_magnets, drives)
     for balls in identical_balls:
         _copy_balls(builder, stage, balls, bodies, shapes_of_magnets, magnets)
     warnings = tuple(map(str, report.warnings))
@@ -202,7 +202,7 @@ def _mark_magnets(
 
 
 def _scene_keys(
-    builder, stage, contents: StageContents, clock: StageClock, bodies, shapes_of_magnets, currents: dict[int, Keys]
+    builder, stage, contents: StageContents, clock: StageClock, bodies, shapes_of_magnets, drives
 ) -> SceneKeys:
     """Return the keys of the stage, with times in seconds, by Newton's bodies and shapes."""
 
@@ -219,8 +219,9 @@ def _scene_keys(
         for prim, keys in contents.magnetization_keys.items()
         for shape in shapes_of_magnets[prim]
     }
-    currents = {shape: in_seconds(keys) for shape, keys in currents.items()}
-    return SceneKeys(motions, magnetizations, currents, contents.field_keys and in_seconds(contents.field_keys))
+    currents, voltages = ({shape: in_seconds(keys) for shape, keys in drive.items()} for drive in drives)
+    field = contents.field_keys and in_seconds(contents.field_keys)
+    return SceneKeys(motions, magnetizations, currents, voltages, field)
 
 
 def _shape_rotation(builder, stage, prim: str, shape: int, bodies: dict[str, int]) -> Any:
@@ -228,15 +229,15 @@ def _shape_rotation(builder, stage, prim: str, shape: int, bodies: dict[str, int
     return builder.shape_transform[shape].q if prim in bodies else axis_rotation(shape_axis(stage, prim))
 
 
-def _add_sources(builder: newton.ModelBuilder, sources, bodies: dict[str, int]) -> dict[int, Keys]:
-    """Add the coils and field maps of a stage to the builder; return the keys of currents by the shape of the coil."""
-    currents = {}
+def _add_sources(builder: newton.ModelBuilder, sources, bodies: dict[str, int]) -> tuple[dict[int, Keys], ...]:
+    """Add the coils and field maps of a stage to the builder; return keys of currents and of voltages by shape."""
+    currents, voltages = {}, {}
     for source in (source for placed in sources.values() for source in placed):
         body = -1 if source.body is None else bodies[source.body]
         shape = add_placed_source(builder, source, body, wp.transform(source.position, source.rotation))
-        if source.currents is not None:
-            currents[shape] = source.currents
-    return currents
+        if source.drive is not None:
+            (voltages if source.source.resistance else currents)[shape] = source.drive
+    return currents, voltages
 
 
 def _remove_default_rolling_friction(builder: newton.ModelBuilder) -> None:

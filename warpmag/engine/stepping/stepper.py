@@ -109,7 +109,10 @@ class Stepper:
             travel=TRAVEL_LIMIT, shared_travel=_SHARED_TRAVEL_LIMIT, overlap=OVERLAP_LIMIT,
             growth_margin=_GROWTH_MARGIN, futile_ratio=_FUTILE_RATIO,
         )  # fmt: skip
-        self._machine.set_state_arrays(_arrays(self._state), _arrays(self._saved))
+        currents = magnetics.stepped_arrays()
+        self._machine.set_state_arrays(
+            _arrays(self._state) + currents, _arrays(self._saved) + [wp.clone(array) for array in currents]
+        )
         self._arrays = self._machine.arrays
         self._watched = self._machine.make_monitor(sizes.thickness, sizes.reach)
         self._mirrors = {name: getattr(self._arrays, name) for name in ("status", "peaks", "counts", "log")}
@@ -351,7 +354,7 @@ class Stepper:
             if level == 0:
                 if self._keyed_values:
                     self._keyed_values.set_values(half * dt)
-                self._magnetize(now)
+                self._magnetize(now, dt)
             else:
                 wp.copy(now.body_f, self._shared.body_f)
             self._call_user(now, dt)
@@ -390,13 +393,13 @@ class Stepper:
             wp.copy(self._shared.body_qd, self._state.body_qd)
         if self._keyed_values:
             self._keyed_values.set_values(0.0, shared=self._machine.sharing, substep=dt)
-        self._magnetize(self._shared)
+        self._magnetize(self._shared, dt, sharing=self._machine.sharing)
 
-    def _magnetize(self, state: newton.State) -> None:
-        """Solve the induction and write the magnetic forces at ``state``."""
+    def _magnetize(self, state: newton.State, dt: float, *, sharing: wp.array | None = None) -> None:
+        """Solve the induction and write the magnetic forces at ``state``, for one or the shared substeps of ``dt``."""
         magnetics = self._magnetics
         state.clear_forces()
-        magnetics.induce(state)
+        magnetics.induce(state, dt, sharing=sharing)
         monitor.watch_induction(self._watched, magnetics.error, magnetics.evaluations, magnetics.converged)
         magnetics.add_forces(state)
         bodies = view_bodies(self._model, state)

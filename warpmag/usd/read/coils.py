@@ -23,7 +23,7 @@ from warpmag.usd.schemas import author_schema, has_api, read_fields, world_matri
 from warpmag.usd.values import Finding, finding_of, instance_finding, number
 
 Source = TypeVar("Source", Coil, FieldMap)
-_AMPERE_TURNS = COIL_SCHEMA.usd_name("ampere_turns")
+_AMPERE_TURNS, _VOLTAGE = (COIL_SCHEMA.usd_name(field) for field in ("ampere_turns", "voltage"))
 _BORDER_WARNING = 0.05
 """Largest field on the boundary of a map without a warning, as a fraction of its largest field."""
 
@@ -37,7 +37,8 @@ class PlacedSource:
     body: str | None  # path of the rigid body that it moves with, None where it is fixed in the world
     position: tuple[float, float, float]  # origin of its frame in the world [m]
     rotation: tuple[float, float, float, float]  # rotation of its frame, a quaternion x y z w
-    currents: Keys | None = None  # of a coil's ampere-turns [A] at time codes, None where they are constant
+    # Ampere-turns [A] of a coil, or voltages [V] of a coil with a resistance, at time codes; None where constant
+    drive: Keys | None = None
 
 
 def author_coil(prim: Usd.Prim, coil: Coil) -> None:
@@ -74,10 +75,10 @@ def sources_of(prim: Usd.Prim, transforms: TransformCheck, keys: KeyReader) -> I
         if keys.moves(prim, owner):
             yield Finding(path, f"keys move it within its rigid body {body}: a run holds it still there", "warning")
         if has_api(prim, COIL_SCHEMA.name):
-            currents = keys.keys(prim, _AMPERE_TURNS, _current)
             coil = Coil(**_read(prim, COIL_SCHEMA))
             coil.check(path)
-            yield PlacedSource(path, _scaled(coil, scale), body, position, rotation, currents)
+            drive = _drive(prim, coil, keys)
+            yield PlacedSource(path, _scaled(coil, scale), body, position, rotation, drive)
         if has_api(prim, FIELD_MAP_SCHEMA.name):
             field_map = field_map_of(prim)
             if (ratio := field_map.border_ratio()) > _BORDER_WARNING:
@@ -90,18 +91,18 @@ def sources_of(prim: Usd.Prim, transforms: TransformCheck, keys: KeyReader) -> I
 
 
 def placed_sources(prim: Usd.Prim) -> list[PlacedSource]:
-    """Return the coil and the field map that a prim declares, with keys of currents in seconds since the start."""
+    """Return the coil and the field map that a prim declares, with keys in seconds since the start."""
     stage, sources = prim.GetStage(), []
     for source in sources_of(prim, TransformCheck(), KeyReader(stage)):
         if isinstance(source, Finding):
             if source.severity == "error":
                 raise InputError(str(source))
-        elif source.currents is None:
+        elif source.drive is None:
             sources.append(source)
         else:
             clock = stage_clock(stage)
-            seconds = source.currents.in_seconds(clock.start, clock.time_codes_per_second)
-            sources.append(replace(source, currents=seconds))
+            seconds = source.drive.in_seconds(clock.start, clock.time_codes_per_second)
+            sources.append(replace(source, drive=seconds))
     return sources
 
 
@@ -128,7 +129,7 @@ def field_map_of(prim: Usd.Prim) -> FieldMap:
 
 
 def _read(prim: Usd.Prim, schema: Schema) -> dict:
-    """Return the values of the attributes of a schema by field; only ampere-turns may change over time."""
+    """Return the values of the attributes of a schema by field; uniform ones must not change over time."""
     values = read_fields(prim, schema.attributes)
     for row in schema.attributes:
         if not (attribute := prim.GetAttribute(row.usd_name)):
@@ -141,11 +142,21 @@ def _read(prim: Usd.Prim, schema: Schema) -> dict:
     return values
 
 
-def _current(name: str, value) -> tuple[float]:
-    """Return the checked value of one key of a coil's ampere-turns [A]."""
-    current = number(name, value)
-    check_strength(name, current)
-    return (current,)
+def _drive(prim: Usd.Prim, coil: Coil, keys: KeyReader) -> Keys | None:
+    """Return the keys of a coil's current, or of its voltage if it has a resistance."""
+    currents, voltages = (keys.keys(prim, name, _strength) for name in (_AMPERE_TURNS, _VOLTAGE))
+    if currents is not None and coil.resistance:
+        raise InputError(f"{prim.GetPath()}: {_AMPERE_TURNS} has time samples, but follows from the voltage")
+    if voltages is not None and not coil.resistance:
+        raise InputError(f"{prim.GetPath()}: {_VOLTAGE} has time samples, but the coil has no resistance")
+    return voltages if coil.resistance else currents
+
+
+def _strength(name: str, value) -> tuple[float]:
+    """Return the checked value of one key of a coil's ampere-turns [A] or voltage [V]."""
+    strength = number(name, value)
+    check_strength(name, strength)
+    return (strength,)
 
 
 def _scaled(source: Source, scale: float) -> Source:
