@@ -143,6 +143,30 @@ def test_a_current_follows_its_time_samples(tmp_path, device):
     assert abs(moment / expected - 1.0) < 0.01  # the ball falls by 0.5 % of that in a substep
 
 
+def test_a_stage_drives_a_coil_by_voltages(tmp_path, device):
+    """A voltage that is switched on; a run that is interrupted and resumed ends with the same current."""
+    circuit = coil(
+        *("float warpmag:coil:radius = 0.04", "float warpmag:coil:resistance = 3", "float warpmag:coil:turns = 50"),
+        *("float warpmag:coil:inductance = 0.03", "double3 xformOp:translate = (0, 0, 0.03)"),
+        "float warpmag:coil:voltage.timeSamples = { 0: 0, 1: 6, 2: 6 }",
+        'uniform token[] xformOpOrder = ["xformOp:translate"]',
+    )
+    path, output = write(tmp_path, circuit), tmp_path / "out.usda"
+    currents = []
+    for last in (2, 9):
+        simulation = warpmag.Simulation(path, device=device, dt=1e-3)
+        simulation.run(4, output=output, resume=last == 9, on_frame=lambda frame, last=last: frame < last)
+    currents = simulation.magnetics.coils.currents.numpy()
+    uninterrupted = warpmag.Simulation(path, device=device, dt=1e-3)
+    uninterrupted.run(4)
+    assert np.array_equal(uninterrupted.magnetics.coils.currents.numpy(), currents)
+    rate, keys = 3.0 / 0.03, simulation.model.warpmag.voltage.numpy()
+    assert keys.max() == 6.0
+    frame = 1.0 / 24.0  # a ramp of one frame, then three at 6 V
+    end = 2.0 - 2.0 / (rate * frame) * (1.0 - np.exp(-rate * frame))
+    assert currents[0] == pytest.approx(2.0 + (end - 2.0) * np.exp(-3.0 * rate * frame), rel=2e-3)
+
+
 def test_check_tells_what_a_stage_holds(tmp_path, capsys):
     path = write(tmp_path, coil("float warpmag:coil:radius = 0.02"), coil(*["float warpmag:coil:radius = 1"], name="B"))
     assert cli.main(["check", str(path)]) in (0, None)
@@ -156,6 +180,10 @@ UNEVEN = "float3 xformOp:scale = (1, 2, 1)", 'uniform token[] xformOpOrder = ["x
 @pytest.mark.parametrize(("body", "text"), [
     (coil(), "/Thing: radius: must be positive"),
     (coil("float warpmag:coil:radius = -1"), "/Thing: radius: must be positive"),
+    (coil("float warpmag:coil:radius = 1", "float warpmag:coil:voltage = 1"), "/Thing: voltage is given, but only a"),
+    (coil("float warpmag:coil:radius = 1", "float warpmag:coil:voltage.timeSamples = { 0: 0, 1: 1 }"), "/Thing: "),
+    (coil("float warpmag:coil:radius = 1", "float warpmag:coil:resistance = 1",
+          "float warpmag:coil:ampereTurns.timeSamples = { 0: 0, 1: 1 }"), "but follows from the voltage"),
     (coil("float warpmag:coil:radius = inf"), "/Thing: radius"),
     (coil("token warpmag:coil:radius = \"wide\""), "/Thing: warpmag:coil:radius: 'wide' is not a float"),
     (coil('uniform token warpmag:coil:shape = "ring"'), "/Thing: shape: 'ring'"),
