@@ -18,6 +18,7 @@ from the same fields, so that forces are opposite and equal. Without sources non
 | circuits | coils with voltages: time steps of their currents |
 | solids | tables of permanent bodies and of the polyhedra that bound them |
 | near_cells | cells near permanent bodies: averages of the field, charges on their faces |
+| coil_gradients | gradients of functions of what coils and maps do |
 | expansion | points and tables for the expansion of a field about a ball |
 | `passes.h` | passes over targets and sources |
 | `target_field.h` | field and gradient at a vector of targets, and the force on moments there |

@@ -43,13 +43,16 @@ CUDA_CALLABLE inline DoubleFrame double_frame_of(const Real* t) {
             {n * (x * z + w * y), n * (y * z - w * x), 1 - n * (x * x + y * y)}};
 }
 
-// Field of source s at x, both in the world.
-template <class Arrays> CUDA_CALLABLE inline PointField field_at(const Arrays& arrays, int s, Point x) {
+// Field of source s at x, both in the world, for a strength in place of the source's.
+template <class Arrays> CUDA_CALLABLE inline PointField field_at(const Arrays& arrays, int s, Point x, Point strength) {
     const DoubleFrame frame = double_frame_of((const Real*)arrays.coils.frame.data + 7 * (size_t)s);
     const int begin = arrays.coils.table_begin.data[s], end = arrays.coils.table_end.data[s];
-    const AppliedSource source = {arrays.coils.kind.data[s], point_at((const Real*)arrays.coils.strength.data, s),
+    const AppliedSource source = {arrays.coils.kind.data[s], strength,
                                   arrays.coils.parameters.data + (size_t)s * arrays.coils.parameters.shape[1],
                                   (const Point*)arrays.coils.table.data + begin, end - begin};
     return frame.to_world(field_of(source, frame.to_local(x - frame.origin)));
+}
+template <class Arrays> CUDA_CALLABLE inline PointField field_at(const Arrays& arrays, int s, Point x) {
+    return field_at(arrays, s, x, point_at((const Real*)arrays.coils.strength.data, s));
 }
 }

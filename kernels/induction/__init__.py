@@ -9,6 +9,6 @@ May import ``shared``, ``material``, ``pairs`` and ``cells``.
 | body_response | collective response of bodies of few cells |
 | submagnetization | baseline dynamics by pairs of submagnetizations |
 | energy | energy in equilibrium |
-| tangent | derivatives of the curves in equilibrium, for gradients |
+| tangent | linear solve at an equilibrium, for gradients |
 | `theta_step.h`, `anderson.h` | choice of a world's next step, and its mixture of iterates |
 """

@@ -2,12 +2,14 @@
 
 With the cotangents g_F and g_τ of a body's force and torque, F_body = Σ F_i and τ_body = Σ τ_i + (x_i − c) × F_i, the
 cotangents of a moment's force and torque are g_F + g_τ × (x_i − c) and g_τ. The lever arm x_i − c has F_i × g_τ.
-Warp differentiates positions and permanent moments by the pose.
+Warp differentiates positions and permanent moments by the pose, and the frames of coils. A gradient G by a rotation of
+a frame is that of Σ_k w_k·e_k by its axes e_k, with w_k = G × e_k / 2.
 """
 
 import warp as wp
 
 from warpmag.kernels.rigid.bodies import BodyMoments
+from warpmag.kernels.rigid.sources import SourceShapes
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -84,5 +86,82 @@ def add_pose_gradients(magnets: BodyMoments, model, body_q, by_positions, by_mom
     inputs = [magnets, body_q, model.body_com, by_positions, by_moments, by_arms]
     with wp.Tape() as tape:
         wp.launch(_multiply_poses, len(products), inputs=inputs, outputs=[products], device=device)
+    products.grad.fill_(1.0)
+    tape.backward()
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def _spread_to_coils(
+    sources: SourceShapes,
+    body_q_in: wp.array[wp.transform],
+    body_com_in: wp.array[wp.vec3],
+    body_flags_in: wp.array[wp.int32],
+    body_f_in: wp.array[wp.spatial_vector],
+    force_out: wp.array[wp.vec3],
+    torque_out: wp.array[wp.vec3],
+    center_out: wp.array[wp.vec3],
+):
+    s = wp.tid()
+    body = sources.shape_body[sources.shape[s]]
+    force_out[s] = wp.vec3()
+    torque_out[s] = wp.vec3()
+    if body < 0:
+        return
+    if (body_flags_in[body] & sources.kinematic_flag) != 0:
+        return
+    force_out[s] = wp.spatial_top(body_f_in[body])
+    torque_out[s] = wp.spatial_bottom(body_f_in[body])
+    center_out[s] = wp.transform_point(body_q_in[body], body_com_in[body])
+
+
+def spread_to_coils(sources: SourceShapes, model, body_q, body_f, force_cotangents, torque_cotangents, centers) -> None:
+    """Write the cotangents of the reactions on coils, and the center of mass of each coil's body, shape [coils] each.
+
+    ``body_f`` are the cotangents of the bodies' wrenches. Coils that forces do not move have none.
+    """
+    inputs = [sources, body_q, model.body_com, model.body_flags, body_f]
+    outputs = [force_cotangents, torque_cotangents, centers]
+    wp.launch(_spread_to_coils, len(centers), inputs=inputs, outputs=outputs, device=centers.device)
+
+
+@wp.kernel(module="unique", enable_backward=True)
+def _multiply_frames(
+    sources: SourceShapes,
+    body_q: wp.array[wp.transform],
+    body_com: wp.array[wp.vec3],
+    frames: wp.array[wp.transform],
+    by_sources: wp.array2d[float],
+    products_out: wp.array[float],
+):
+    s = wp.tid()
+    shape = sources.shape[s]
+    body = sources.shape_body[shape]
+    outer = wp.transform_identity()
+    product = by_sources[s, 0] * sources.strengths[shape]
+    if body >= 0:
+        outer = body_q[body]
+        center = wp.transform_point(outer, body_com[body])
+        product = product + wp.dot(center, wp.vec3(by_sources[s, 7], by_sources[s, 8], by_sources[s, 9]))
+    inner = sources.shape_frames[shape]
+    origin = wp.transform_point(outer, wp.transform_get_translation(inner))
+    product = product + wp.dot(origin, wp.vec3(by_sources[s, 1], by_sources[s, 2], by_sources[s, 3]))
+    turn = wp.vec3(by_sources[s, 4], by_sources[s, 5], by_sources[s, 6])
+    for k in range(3):
+        unit = wp.vec3(float(k == 0), float(k == 1), float(k == 2))
+        axis = wp.transform_vector(outer, wp.transform_vector(inner, unit))
+        product = product + 0.5 * wp.dot(axis, wp.cross(turn, wp.transform_vector(frames[s], unit)))
+    products_out[s] = product
+
+
+def add_coil_gradients(sources: SourceShapes, model, body_q, frames, by_sources) -> None:
+    """Add to the gradients of ``body_q``, of the shapes' transforms and of strengths, where they have one.
+
+    ``frames`` are those of the coils in the world, ``by_sources`` as in ``applied.coil_gradients``.
+    """
+    device = body_q.device
+    products = wp.zeros(len(frames), dtype=float, device=device, requires_grad=True)
+    inputs = [sources, body_q, model.body_com, frames, by_sources]
+    with wp.Tape() as tape:
+        wp.launch(_multiply_frames, len(products), inputs=inputs, outputs=[products], device=device)
     products.grad.fill_(1.0)
     tape.backward()

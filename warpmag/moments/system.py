@@ -328,7 +328,7 @@ class MomentSystem:
     def gradients(self) -> SystemGradients:
         """Gradients of solves and forces. Their buffers are allocated at the first access."""
         arrays = self._packed, self._induction, self.material, self.worlds, self.world_ranges
-        return SystemGradients(*arrays, self.rtol, self.fmm_rtol)
+        return SystemGradients(*arrays, self.rtol, self.fmm_rtol, self.sources)
 
     def start_cold(self, chosen: wp.array | None = None):
         """Start the next solve as the first one, from zero magnetization, in chosen worlds.

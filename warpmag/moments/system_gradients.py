@@ -29,6 +29,8 @@ import numpy as np
 import warp as wp
 
 from warpmag.errors import ConvergenceWarning, InputError
+from warpmag.kernels.applied.coil_gradients import CoilGradients
+from warpmag.kernels.applied.sources import FieldSources
 from warpmag.kernels.induction.tangent import Tangent
 from warpmag.kernels.material.curves import CurveParameters
 from warpmag.kernels.pairs.evaluate import PairEvaluation
@@ -55,8 +57,10 @@ class SystemGradients:
         ranges: (First moment, first permanent moment, end) of each world.
         rtol: Relative error of the solves, and of the linear solve.
         fmm_rtol: Relative error of fields by the fast multipole method; None means sums over all pairs.
+        sources: Coils and field maps; None without them.
 
     Attributes:
+        coils: Gradients by coils and field maps; None without them. The caller writes their state after :meth:`load`.
         positions: State: positions [m], shape [n].
         moments: State: moments [A·m²], shape [n].
         h: State: field [A/m] in which M = f(H), shape [n].
@@ -66,7 +70,17 @@ class SystemGradients:
         by_moments: Field T η, the gradient by permanent moments [1/(A·m²)], after :meth:`solve`, shape [n].
     """
 
-    def __init__(self, packed, state, material: CurveParameters, worlds, ranges, rtol: float, fmm_rtol: float | None):
+    def __init__(
+        self,
+        packed,
+        state,
+        material: CurveParameters,
+        worlds,
+        ranges,
+        rtol: float,
+        fmm_rtol: float | None,
+        sources: FieldSources | None = None,
+    ):
         """Allocate the buffers."""
         self._moments = PackedMoments(packed.radii, largest_radius=packed.largest_radius, groups=worlds, moving=False)
         self._acting, self._bodies = self._moments.twin(), self._moments.twin(packed.labels)
@@ -91,6 +105,7 @@ class SystemGradients:
             if self._fast
             else PairGradients(self._moments, ends, cotangents=self._acting.moments)
         )
+        self.coils = CoilGradients(sources, self._bodies, worlds) if sources and sources.applied else None
         self.by_field = self._tangent.eta
         self.by_positions, self.by_moments = self._fields.by_positions, self._fields.by_moments
 
@@ -110,6 +125,8 @@ class SystemGradients:
         for fast in self._fast:
             fast.build()
         self._tangent.linearize(self.h)
+        if self.coils is not None:
+            self.coils.by_sources.zero_()
 
     def evaluate(self) -> None:
         """Launch one field evaluation of the linear solve."""
@@ -120,8 +137,11 @@ class SystemGradients:
 
         They are by positions, moments and the external field at fixed moments; :meth:`solve` continues them.
         """
-        self._wrenches.launch(force_cotangents, torque_cotangents)
-        return self._wrenches
+        sums = self._wrenches
+        sums.launch(force_cotangents, torque_cotangents)
+        if self.coils is not None:
+            self.coils.launch_wrench(force_cotangents, torque_cotangents, sums.by_positions, sums.by_moments)
+        return sums
 
     def solve(self, by_moments, by_field=None, *, warm: bool = False) -> None:
         """Compute the gradients of a function of the equilibrium.
@@ -145,6 +165,8 @@ class SystemGradients:
             wp.capture_while(tangent.condition, self._iterate)
         tangent.finish(None if by_field is None else self._given_field)
         self._fields.launch()
+        if self.coils is not None:
+            self.coils.launch_field(self.by_field, self.by_positions, self.by_moments)
 
     def _iterate(self):
         """Launch an iteration of the linear solve."""

@@ -21,7 +21,7 @@ from warpmag.engine.magnets.grouping import BodyMagnet, find_magnets
 from warpmag.engine.magnets.imported_field import imported_field
 from warpmag.engine.magnets.magnet_system import KINEMATIC, make_system
 from warpmag.engine.magnets.model_values import ModelValues, magnetic_arrays
-from warpmag.engine.magnets.pose_gradients import record_forces
+from warpmag.engine.magnets.pose_gradients import ForceGradients
 from warpmag.engine.magnets.sources import ModelSources
 from warpmag.engine.magnets.world_reset import WorldMask, WorldRows
 from warpmag.errors import ConvergenceWarning, InputError
@@ -139,6 +139,7 @@ class Magnetics:
         self._sources.bind(self.system)
         self.coils = self._sources.circuits
         self._map_bodies()
+        self._gradients = ForceGradients(self.system, self._body_moments, self._sources, model)
         self._prepare_reset()
         set_conductivities(model, self.magnets, self.system, float(dt))
         if imported is not None:
@@ -291,7 +292,9 @@ class Magnetics:
     def apply(self, state: newton.State, dt: float | None = None) -> None:
         """Add the magnetic forces at the poses of ``state`` to ``state.body_f``; capturable in a graph.
 
-        On an active ``wp.Tape`` the forces are differentiated by poses, if ``state.body_q`` requires a gradient.
+        On an active ``wp.Tape`` the forces are differentiated by each of these arrays that requires a gradient:
+        ``state.body_q``, ``model.shape_transform`` (placement of coils that no body carries),
+        ``model.warpmag.strength`` (currents), ``model.warpmag.magnetization`` and :attr:`external_field`.
 
         Args:
             state: State with poses ``body_q``. Forces are added to ``body_f``, which is not cleared. Conducting magnets
@@ -316,7 +319,7 @@ class Magnetics:
             self.induce(state, dt)
             self.add_forces(state)
             if tape is not None:
-                record_forces(tape, self.system, self._body_moments, self._model, state)
+                self._gradients.record(tape, state)
         if self.device.is_cpu and not self.device.is_capturing:
             self._warn_unconverged(level=3)
 
@@ -332,7 +335,7 @@ class Magnetics:
         if dt is not None:
             check_positive("dt", dt)
         self._check_state(state, "body_q")
-        check_untaped({"state.body_q": state.body_q}, "only Magnetics.apply records one")
+        check_untaped(self._gradients.arguments(state), "only Magnetics.apply records one")
         self._induced = True
         gather_moments(
             *(state.body_q, self._body_moments, values.present, values.used, system.positions, system.moments),

@@ -1,71 +1,113 @@
-"""Gradients of the forces on bodies by their poses, recorded on Warp's tape."""
+"""Gradients of the forces on bodies by poses, coils, magnetizations and the external field, recorded on Warp's tape."""
 
 import warp as wp
 
+from warpmag.declarations.attributes import NAMESPACE
+from warpmag.engine.magnets.sources import ModelSources
 from warpmag.errors import InputError
 from warpmag.kernels.rigid.bodies import BodyMoments
-from warpmag.kernels.rigid.pose_gradients import add_pose_gradients, spread_cotangents
+from warpmag.kernels.rigid.pose_gradients import (
+    add_coil_gradients,
+    add_pose_gradients,
+    spread_cotangents,
+    spread_to_coils,
+)
 from warpmag.kernels.shared.axpy import launch_add_scaled
 from warpmag.moments.system import MomentSystem
 from warpmag.moments.tape import differentiable, paused_tape
 
 
-def check_pose_gradients(system: MomentSystem) -> None:
-    """Raise ``InputError`` if the forces of a system have no gradients by poses."""
+def _check_gradients(name: str, system: MomentSystem, sources: ModelSources) -> None:
+    """Raise ``InputError`` if the forces of a system with sources have no gradients, by the array ``name``."""
     settings = system.settings
     reasons = {
         f"the force {settings.force!r}": settings.force != "kelvin",
         f"the dynamics {settings.dynamics!r}": settings.dynamics != "theta",
         f"the contact model {settings.contact_model!r}": settings.contact_model != "dipole",
         "a body of cells": system.rotations is not None,
-        "a coil, a field map or the near field of a permanent body": system.sources is not None,
+        "the near field of a permanent body": system.sources is not None and bool(system.sources.solids),
+        "a coil with a resistance, whose current follows from voltages,": sources.circuits is not None,
         "recoil permeability": system.bias is not None,
         "eddy currents": system.eddy is not None,
     }
     for reason, applies in reasons.items():
         if applies:
-            raise InputError(f"state.body_q: requires a gradient, but {reason} has none")
+            raise InputError(f"{name}: requires a gradient, but {reason} has none")
 
 
-def record_forces(tape: wp.Tape, system: MomentSystem, magnets: BodyMoments, model, state) -> None:
-    """Record the gradients of the forces that were just added to ``state.body_f``, if ``state.body_q`` requires one."""
-    if not differentiable({"state.body_q": state.body_q}):
-        return
-    check_pose_gradients(system)
-    state.body_f.requires_grad = True
-    # the next call overwrites the system's arrays
-    solved = _SolvedMoments(system)
+class ForceGradients:
+    """Gradients of the forces that :meth:`Magnetics.apply` adds to ``state.body_f``."""
 
-    def add_gradients():
-        with paused_tape():
-            cotangents = spread_cotangents(
-                magnets, model, state.body_q, solved.positions, solved.forces, state.body_f.grad
-            )
-            by_positions, by_moments = solved.product(*cotangents[:2])
-            add_pose_gradients(magnets, model, state.body_q, by_positions, by_moments, cotangents[2])
+    def __init__(self, system: MomentSystem, magnets: BodyMoments, sources: ModelSources, model):
+        """Prepare the gradients of a system with the moments ``magnets`` and the coils ``sources`` of a model."""
+        self._system, self._magnets, self._sources, self._model = system, magnets, sources, model
 
-    tape.record_func(add_gradients, [state.body_q, state.body_f])
+    def arguments(self, state) -> dict[str, wp.array]:
+        """Return the arrays that require a gradient, by name."""
+        attributes = getattr(self._model, NAMESPACE)
+        return differentiable(
+            {
+                "state.body_q": state.body_q,
+                "model.shape_transform": self._model.shape_transform,
+                "model.warpmag.magnetization": attributes.magnetization,
+                "model.warpmag.strength": attributes.strength,
+                "external_field": self._system.external_field,
+            }
+        )
+
+    def record(self, tape: wp.Tape, state) -> None:
+        """Record the gradients of the forces that were just added, if an argument requires one."""
+        required = self.arguments(state)
+        if not required:
+            return
+        _check_gradients(next(iter(required)), self._system, self._sources)
+        state.body_f.requires_grad = True
+        solved = _SolvedMoments(self._system)  # the next call overwrites the system's arrays
+
+        def add_gradients():
+            with paused_tape():
+                self._add(solved, state.body_q, state.body_f.grad)
+
+        tape.record_func(add_gradients, [*required.values(), state.body_f])
+
+    def _add(self, solved: "_SolvedMoments", body_q: wp.array, body_f: wp.array) -> None:
+        """Add to the gradients of the arguments, from those by the wrenches ``body_f``."""
+        model, gradients = self._model, self._system.gradients
+        solved.load()
+        force, torque, arms = spread_cotangents(self._magnets, model, body_q, solved.positions, solved.forces, body_f)
+        coils = gradients.coils
+        if coils is not None:
+            cotangents = coils.source_force_cotangents, coils.source_torque_cotangents
+            spread_to_coils(self._sources.on_device, model, body_q, body_f, *cotangents, coils.centers)
+        sums = gradients.wrench(force, torque)
+        gradients.solve(sums.by_moments, warm=True)  # from the solution of the substep after it
+        gradients.check()
+        launch_add_scaled(sums.by_positions, gradients.by_positions)
+        launch_add_scaled(sums.by_moments, gradients.by_moments)
+        add_pose_gradients(self._magnets, model, body_q, gradients.by_positions, gradients.by_moments, arms)
+        if coils is not None:
+            add_coil_gradients(self._sources.on_device, model, body_q, coils.frames, coils.by_sources)
+        by_external_field = self._system.external_field.grad
+        if by_external_field is not None:
+            launch_add_scaled(sums.by_external_field, by_external_field)
+            launch_add_scaled(gradients.by_field, by_external_field)
 
 
 class _SolvedMoments:
-    """Copy of the moments, the fields and the forces of a system after a solve."""
+    """Copy of the moments, the fields, the forces and the coils of a system after a solve."""
 
     def __init__(self, system: MomentSystem):
         """Copy the arrays."""
-        self.positions, self.forces = wp.clone(system.positions), wp.clone(system.forces)
-        self._moments, self._h, self._external_field = map(wp.clone, (system.moments, system.h, system.external_field))
-        self._system = system
+        self._system, self.positions, self.forces = system, wp.clone(system.positions), wp.clone(system.forces)
+        self._moments, self._h = wp.clone(system.moments), wp.clone(system.h)
+        self._external_field = wp.clone(system.external_field, requires_grad=False)
+        coils = system.sources
+        self._coils = None if coils is None else (wp.clone(coils.frames), wp.clone(coils.strengths))
 
-    def product(self, force_cotangents: wp.array, torque_cotangents: wp.array) -> tuple[wp.array, wp.array]:
-        """Return the gradients by positions and by permanent moments, shape [n] each; others are not meaningful."""
+    def load(self) -> None:
+        """Compute gradients at this state."""
         gradients = self._system.gradients
         gradients.load(self.positions, self._moments, self._h, self._external_field)
-        sums = gradients.wrench(force_cotangents, torque_cotangents)
-        gradients.solve(sums.by_moments, warm=True)  # from the solution of the substep after it
-        gradients.check()
-        for partial, total in (
-            (sums.by_positions, gradients.by_positions),
-            (sums.by_moments, gradients.by_moments),
-        ):
-            launch_add_scaled(partial, total)
-        return gradients.by_positions, gradients.by_moments
+        if self._coils is not None and gradients.coils is not None:
+            wp.copy(gradients.coils.frames, self._coils[0])
+            wp.copy(gradients.coils.strengths, self._coils[1])

@@ -32,6 +32,7 @@ class ModelSources:
         shapes: Shapes that represent sources, in the order of ``applied``.
         applied: The sources as a :class:`MomentSystem` takes them.
         circuits: Coils with voltages, None without any; set by :meth:`bind`.
+        on_device: Their shapes and bodies, after :meth:`bind`.
     """
 
     def __init__(self, model: newton.Model, magnet_worlds: np.ndarray):
@@ -62,7 +63,7 @@ class ModelSources:
 
         movable = sorted((source.body, index) for index, source in enumerate(self.applied) if source.movable)
         bodies, starts = np.unique([body for body, _ in movable], return_index=True)
-        self._shapes = shapes = SourceShapes()
+        self.on_device = shapes = SourceShapes()
         shapes.shape = on_device(self.shapes)
         shapes.shape_body, shapes.shape_frames = model.shape_body, model.shape_transform
         shapes.strengths = getattr(model, NAMESPACE).strength
@@ -75,18 +76,18 @@ class ModelSources:
     def gather(self, body_q) -> None:
         """Write the frames and the strengths of the sources to the system."""
         if self.applied:
-            gather_sources(body_q, self._shapes, self._system.sources.frames, self._system.sources.strengths)
+            gather_sources(body_q, self.on_device, self._system.sources.frames, self._system.sources.strengths)
 
     def gather_motion(self, state: newton.State, motion) -> None:
         """Write the velocities of the sources, shape [sources, 6] (``kernels.applied.sources``)."""
         if self.applied:
-            gather_source_motion(self._shapes, self._model, state, self._system.sources.frames, motion)
+            gather_source_motion(self.on_device, self._model, state, self._system.sources.frames, motion)
 
     def add_reactions(self, state: newton.State) -> None:
         """Add the forces of the moments on the sources to the forces on their bodies."""
         if self.applied:
             frames, wrenches = self._system.sources.frames, self._system.source_interaction.wrenches
-            add_reactions(self._shapes, self._model, state, frames, wrenches)
+            add_reactions(self.on_device, self._model, state, frames, wrenches)
 
     def set_strength(self, name: str, selector: int | str, value) -> None:
         """Set the strengths of the sources that match a shape index or a shell pattern of labels.
@@ -95,7 +96,7 @@ class ModelSources:
         ``name``. Coils with voltages raise :class:`InputError`.
         """
         shapes = self._matching(name, selector, driven=False)
-        set_strengths(self._numbers(name, value, len(shapes)), shapes, self._shapes.strengths)
+        set_strengths(self._numbers(name, value, len(shapes)), shapes, self.on_device.strengths)
 
     def set_voltage(self, name: str, selector: int | str, value) -> None:
         """Set the voltages of coils, as :meth:`set_strength` sets strengths; other sources raise InputError."""
