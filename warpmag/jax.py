@@ -33,13 +33,16 @@ import numpy as np
 import warp as wp
 from jax.custom_derivatives import SymbolicZero  # pyright: ignore[reportMissingImports]
 
+from warpmag.declarations.checks import short_repr
 from warpmag.errors import InputError
 from warpmag.moments import fields, induction
-from warpmag.moments.arrays import DTYPES, dtype_name, vec3_type
+from warpmag.moments.arrays import DTYPES, dtype_name, real_array, resolve_device, shape_message, vec3_type
 
 _POSITIONAL = inspect.Parameter.POSITIONAL_OR_KEYWORD
 _SCALARS = ("radii", "target_radii", "saturation", "susceptibility")
 """Arguments of one number for each ball; the others are vectors."""
+_PLACES = ("positions", "targets", "dipoles")
+"""Arguments whose number of vectors other arguments follow."""
 
 
 def h_field(positions, moments, targets=None, *, radii=None, target_radii=None, method="auto", rtol=None, device=None):
@@ -49,8 +52,8 @@ def h_field(positions, moments, targets=None, *, radii=None, target_radii=None, 
     """
     arrays = {"positions": positions, "moments": moments, "targets": targets}
     arrays |= {"radii": radii, "target_radii": target_radii}
-    call = _Call("h_field", (("method", method), ("rtol", rtol)), device)
-    (field,) = _differentiable(call, _read(arrays, {"target_radii": "targets"}))
+    call = _call("h_field", {"method": method, "rtol": rtol}, device)
+    (field,) = _differentiable(call, _read(arrays, {"target_radii": "targets"}, "moments"))
     return field
 
 
@@ -60,8 +63,8 @@ def wrench(positions, moments, *, radii=None, external_field=None, method="auto"
     Gradients by ``positions``, ``moments`` and ``external_field``. Computes on the arrays' device, or on ``device``.
     """
     arrays = {"positions": positions, "moments": moments, "radii": radii, "external_field": external_field}
-    call = _Call("wrench", (("method", method), ("rtol", rtol)), device)
-    return _differentiable(call, _read(arrays, {}))
+    call = _call("wrench", {"method": method, "rtol": rtol}, device)
+    return _differentiable(call, _read(arrays, {}, "moments"))
 
 
 @partial(
@@ -105,32 +108,58 @@ def solve_induction(
 
     Gradients by all arrays, with a relative error of about ``rtol``. Computes on the arrays' device, or on ``device``.
     """
-    dipoles, dipole_moments = (np.zeros((0, 3)),) * 2 if permanent is None else permanent
+    dipoles, dipole_moments = induction.permanent_dipoles(permanent)
     arrays = {"positions": positions, "radii": radii, "saturation": saturation, "susceptibility": susceptibility}
     arrays |= {"external_field": external_field, "dipoles": dipoles, "dipole_moments": dipole_moments}
     if saturation is None:  # of measured curves
         del arrays["susceptibility"]
-    arrays = _read(arrays, {"dipole_moments": "dipoles"})
+    arrays = _read(arrays, {"dipole_moments": "dipoles"}, "radii")
     curve = tuple(curve) if isinstance(curve, list) else curve
-    options = ("curve", curve), ("method", method), ("rtol", rtol), ("max_evaluations", max_evaluations)
-    m, h = _differentiable(_Call("solve_induction", options, device), arrays)
+    options = {"curve": curve, "method": method, "rtol": rtol, "max_evaluations": max_evaluations}
+    m, h = _differentiable(_call("solve_induction", options, device), arrays)
     return InductionArrays(m, h, arrays, device)
 
 
-def _read(arrays: dict, owners: dict[str, str]) -> dict:
+def _read(arrays: dict, owners: dict[str, str], needed: str) -> dict:
     """Return the given arrays with all their dimensions, of the type of ``positions``.
 
-    ``owners`` names the positions that an argument belongs to, if they are not ``positions``.
+    ``owners`` names the positions that an argument belongs to, if they are not ``positions``. The arguments
+    ``positions`` and ``needed`` must not be None.
     """
-    positions = jnp.asarray(arrays["positions"])
-    if positions.dtype not in (jnp.float32, jnp.float64):
-        raise InputError(f"positions: must be float32 or float64, got {positions.dtype}")
-    given = {name: jnp.asarray(value, positions.dtype) for name, value in arrays.items() if value is not None}
+    required = "positions", needed
+    given = {name: _real(name, value) for name, value in arrays.items() if value is not None or name in required}
+    dtype = given["positions"].dtype
+    if dtype not in (jnp.float32, jnp.float64):
+        raise InputError(f"positions: must be float32 or float64, got {dtype}")
     for name, value in given.items():
-        ndim, count = 1 if name in _SCALARS else 2, len(given[owners.get(name, "positions")])
-        if value.ndim < ndim:
-            given[name] = jnp.broadcast_to(value, (count, 3)[:ndim])
+        owner = owners.get(name, "positions")
+        if owner not in given:
+            raise InputError(f"{name}: only with {owner}")
+        given[name] = _expanded(name, value.astype(dtype), None if name in _PLACES else len(given[owner]))
     return given
+
+
+def _real(name: str, value) -> Any:
+    """Return an array of JAX; raise :class:`InputError` unless it has real numbers."""
+    if not isinstance(value, jax.Array):
+        value = jnp.asarray(real_array(name, value, single=True))
+    if value.dtype == bool or jnp.iscomplexobj(value):
+        raise InputError(f"{name}: must be real numbers, got {value.dtype}")
+    return value
+
+
+def _expanded(name: str, value, count: int | None):
+    """Return ``count`` numbers or vectors, or those of one for all; None for ``count`` takes any number.
+
+    An array of another shape raises :class:`InputError`.
+    """
+    ndim = 1 if name in _SCALARS else 2
+    if count is not None and value.shape in ((), (3,)[: ndim - 1]):
+        value = jnp.broadcast_to(value, (count, 3)[:ndim])
+    if value.ndim != ndim or value.shape != ((len(value) if count is None else count), 3)[:ndim]:
+        expected = f"[{'n' if count is None else count}{', 3' * (ndim - 1)}]"
+        raise InputError(shape_message(name, expected, value))
+    return value
 
 
 @dataclass(frozen=True)
@@ -190,6 +219,16 @@ class _Call:
             return [result.numpy() for result in self.run(needed, inputs)]
 
         return jax.pure_callback(through_host, shapes, arrays, vmap_method="sequential")
+
+
+def _call(function: str, options: dict, device) -> _Call:
+    """Return a call; a device or an option that JAX cannot compare raises :class:`InputError`."""
+    for name, value in options.items():
+        try:
+            hash(value)
+        except TypeError:
+            raise InputError(f"{name}: must be a number or a name, got {short_repr(value)}") from None
+    return _Call(function, tuple(options.items()), None if device is None else resolve_device(device))
 
 
 def _kind(name: str, dtype: str) -> type:

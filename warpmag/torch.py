@@ -27,6 +27,8 @@ import warp as wp
 
 from warpmag.errors import InputError
 from warpmag.moments import fields, induction
+from warpmag.moments.arrays import real_array, shape_message
+from warpmag.moments.induction import permanent_dipoles
 
 _DTYPES = {torch.float32: ("float32", wp.float32, wp.vec3), torch.float64: ("float64", wp.float64, wp.vec3d)}
 """By type of tensors: type of a call, and Warp's types of scalars and vectors."""
@@ -43,7 +45,7 @@ def h_field(positions, moments, targets=None, *, radii=None, target_radii=None, 
     def call(dtype, **arrays):
         return [fields.h_field(method=method, rtol=rtol, dtype=dtype, **arrays)]
 
-    (field,) = _recorded(call, tensors, {"target_radii": "targets"})
+    (field,) = _recorded(call, tensors, {"target_radii": "targets"}, "moments")
     return field
 
 
@@ -57,7 +59,7 @@ def wrench(positions, moments, *, radii=None, external_field=None, method="auto"
     def call(dtype, **arrays):
         return fields.wrench(method=method, rtol=rtol, dtype=dtype, **arrays)
 
-    return _recorded(call, tensors, {})
+    return _recorded(call, tensors, {}, "moments")
 
 
 @dataclass(frozen=True)
@@ -80,9 +82,9 @@ class InductionTensors:
     def wrench(self):
         """Return forces [N] and torques [N·m] on the balls by Kelvin's law, shape [n, 3] each."""
         x, count = self._inputs["positions"], len(self.magnetizations)
-        radii = _filled(self._inputs["radii"], x, count, 1)
+        radii = _filled("radii", self._inputs["radii"], x, count)
         moments = (4.0 / 3.0 * math.pi) * radii[:, None] ** 3 * self.magnetizations
-        external_field = _filled(self._inputs["external_field"], x, count, 2)
+        external_field = _filled("external_field", self._inputs["external_field"], x, count)
         dipoles = [torch.as_tensor(part, dtype=x.dtype, device=x.device) for part in self._inputs["permanent"]]
         forces, torques = wrench(
             torch.cat([x, dipoles[0]]),
@@ -102,9 +104,9 @@ def solve_induction(
     Gradients by all arguments that are numbers but ``initial``, ``rtol`` and ``max_evaluations``. They have a relative
     error of about ``rtol``.
     """
-    permanent = (positions.new_zeros(0, 3), positions.new_zeros(0, 3)) if permanent is None else permanent
+    dipoles, dipole_moments = permanent_dipoles(permanent)
     tensors = {"positions": positions, "radii": radii, "saturation": saturation, "susceptibility": susceptibility}
-    tensors |= {"external_field": external_field, "dipoles": permanent[0], "dipole_moments": permanent[1]}
+    tensors |= {"external_field": external_field, "dipoles": dipoles, "dipole_moments": dipole_moments}
     if saturation is None:  # of measured curves
         del tensors["susceptibility"]
     solved = []
@@ -117,34 +119,59 @@ def solve_induction(
         solved.append(result)
         return [result.magnetizations, result.h_field]
 
-    m, h = _recorded(call, tensors, {"dipole_moments": "dipoles"})
-    inputs = {"positions": positions, "radii": radii, "external_field": external_field, "permanent": permanent}
+    m, h = _recorded(call, tensors, {"dipole_moments": "dipoles"}, "radii")
+    inputs = {
+        "positions": positions,
+        "radii": radii,
+        "external_field": external_field,
+        "permanent": (dipoles, dipole_moments),
+    }
     return InductionTensors(m, h, solved[0].error, solved[0].evaluations, solved[0].converged, inputs)
 
 
 _SCALARS = ("radii", "target_radii", "saturation", "susceptibility")
 """Arguments of one number for each ball; the others are vectors."""
+_PLACES = ("positions", "targets", "dipoles")
+"""Arguments whose number of vectors other arguments follow."""
 
 
-def _filled(value, like, count: int, ndim: int):
-    """Return a tensor of ``count`` numbers or vectors from fewer dimensions, of the type and device of ``like``."""
-    value = 0.0 if value is None else value
-    tensor = torch.as_tensor(value, dtype=like.dtype, device=like.device)
-    return tensor if tensor.ndim >= ndim else tensor.expand(*((count, 3)[:ndim]))
+def _filled(name: str, value, like, count: int | None):
+    """Return a tensor of ``count`` numbers or vectors, or of one for all, of the type and device of ``like``.
+
+    A value of another shape, or of no real numbers, raises :class:`InputError`; None for ``count`` takes any number.
+    """
+    if not isinstance(value, torch.Tensor):
+        array = real_array(name, 0.0 if value is None else value)
+        value = torch.empty(array.shape, dtype=torch.float64).copy_(torch.tensor(array.copy()))  # strides of no vectors
+    if value.dtype is torch.bool or value.is_complex():
+        raise InputError(f"{name}: must be real numbers, got {value.dtype}")
+    tensor = value.to(device=like.device, dtype=like.dtype)
+    ndim = 1 if name in _SCALARS else 2
+    if count is not None and (tensor.ndim == 0 or tuple(tensor.shape) == (3,)[: ndim - 1]):
+        tensor = tensor.expand(*(count, 3)[:ndim])
+    if tensor.ndim != ndim or tuple(tensor.shape) != ((len(tensor) if count is None else count), 3)[:ndim]:
+        expected = f"[{'n' if count is None else count}{', 3' * (ndim - 1)}]"
+        raise InputError(shape_message(name, expected, tensor))
+    return tensor
 
 
-def _recorded(call, tensors: dict, owners: dict[str, str]):
+def _recorded(call, tensors: dict, owners: dict[str, str], needed: str):
     """Return the results of a call on tensors by name, with gradients.
 
-    ``owners`` names the positions that an argument belongs to, if they are not ``positions``.
+    ``owners`` names the positions that an argument belongs to, if they are not ``positions``. The argument ``needed``
+    must not be None.
     """
     positions = tensors["positions"]
     if not isinstance(positions, torch.Tensor) or positions.dtype not in _DTYPES:
         raise InputError("positions: must be a tensor of float32 or float64")
+    if tensors[needed] is None:
+        raise InputError(f"{needed}: must be real numbers, got None")
     given = {name: value for name, value in tensors.items() if value is not None}
     for name in given:
-        count = len(given[owners.get(name, "positions")])
-        given[name] = _filled(given[name], positions, count, 1 if name in _SCALARS else 2)
+        owner = owners.get(name, "positions")
+        if owner not in given:
+            raise InputError(f"{name}: only with {owner}")
+        given[name] = _filled(name, given[name], positions, None if name in _PLACES else len(given[owner]))
     return _Call.apply(call, tuple(given), *given.values())
 
 

@@ -6,6 +6,8 @@
 Each call has one to three wild arguments among right ones: numbers, texts, arrays of other sizes, types and memory,
 states and models of other worlds. It must end in an ``InputError`` of one line or in finite results. The calls run in
 child processes, so that a crash counts; it ends the child, and the next one goes on behind the call that did it.
+Simulations and displays take long to make: a child keeps them as long as calls are refused.
+``warpmag.torch`` and ``warpmag.jax`` are called where their libraries are installed.
 """
 
 import argparse
@@ -19,8 +21,11 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import newton
@@ -28,12 +33,16 @@ import numpy as np
 import warp as wp
 
 import warpmag
+from warpmag.declarations.keys import Keys
 from warpmag.moments.probe import FieldProbe
 
 SECONDS, MEMORY = 60, 8 << 30
 """CPU time of a call [s], with kernels compiled, and address space of a child [bytes]."""
 M = (0.0, 0.0, 1e6)
 POINTS = np.array([(0.0, 0.0, 0.05), (0.02, 0.0, 0.0)])
+KEYS = Keys(np.array([0.0, 1.0]), np.array([[1.0], [2.0]]), "linear").to_text()
+OFTEN = 50
+"""Calls without arguments after which a world is made anew; calls with arguments make it anew if they were taken."""
 
 
 def new_world(balls: int = 2) -> dict[str, Any]:
@@ -51,6 +60,7 @@ def new_world(balls: int = 2) -> dict[str, Any]:
     coil = warpmag.add_coil(builder, body=0, radius=0.01, ampere_turns=1.0, label="coil")
     builder.add_site(0, label="site")
     model = builder.finalize(device="cpu")
+    model.warpmag.current_keys[coil] = KEYS  # as USD's importer leaves them
     magnetics, state = warpmag.Magnetics(model), model.state()
     magnetics.apply(state)
     viewer = newton.viewer.ViewerNull()
@@ -71,7 +81,7 @@ def new_world(balls: int = 2) -> dict[str, Any]:
         **{
             "moments": np.ones((2, 3)),
             "radii": 0.005,
-            "saturation": 1e6,
+            "saturation": 1.3e6,
             "device": "cpu",
             "dtype": "float32",
             "system": magnetics.system,
@@ -79,20 +89,38 @@ def new_world(balls: int = 2) -> dict[str, Any]:
     } | {"sensor": warpmag.SensorMagnetometer(model, magnetics, "site"), "probe": FieldProbe(magnetics.system, 2)}
 
 
+def _importable(*names: str) -> dict[str, ModuleType]:
+    """Return the modules of warpmag whose libraries are installed, by the last part of their names."""
+    modules = {}
+    for name in names:
+        with suppress(ImportError):
+            modules[name] = import_module(f"warpmag.{name}")
+    return modules
+
+
 # functions of a world, by what has to be made before the call; the arguments are those of the signature
 OWNERS: dict[str, Callable[[dict], Any]] = {
     "Magnetics": lambda world: world["magnetics"],
     "SensorMagnetometer": lambda world: world["sensor"],
     "FieldProbe": lambda world: world["probe"],
+    "KeyedCurrents": lambda world: warpmag.KeyedCurrents(world["model"]),
     "Display": lambda world: warpmag.Display(world["viewer"], world["model"], world["magnetics"]),
     "Simulation": lambda world: warpmag.Simulation(new_builder(world), device="cpu"),
 }
 CLASSES = {"FieldProbe": FieldProbe, **{name: getattr(warpmag, name) for name in OWNERS if name != "FieldProbe"}}
+ARRAYS = ("solve_induction", "h_field", "wrench")
 FUNCTIONS = (
     *("register_attributes", "register_custom_attributes", "add_inducible", "add_permanent", "add_balls", "add_coil"),
-    *("add_field_map", "material", "KeyedCurrents", "solve_induction", "h_field", "wrench"),
+    *("add_field_map", "material", "check", "sweep", *ARRAYS),
 )
 CURVES = ("from_bh", "from_mh", "from_csv")
+LIBRARIES = _importable("torch", "jax")
+SINGLE = {
+    "MagnetizationCurve.from_mh": {"magnetizations": [0.0, 5e5, 1e6]},
+    "MagnetizationCurve.from_csv": {"path": str(Path(__file__).with_name("curve.csv"))},
+    "sweep": {"simulate": list, "world_count": 4, "together": 2},
+}
+"""Right arguments of one function alone."""
 USUAL = ("body", "magnetization", "saturation", "radius", "device", "dtype")
 """Optional arguments that are given in most calls, as users do."""
 PASSIVE = {"persistent_arrays", "stepped_arrays", "warnings", "frame", "allow_restart", "stay"}
@@ -108,22 +136,28 @@ def new_builder(world: dict) -> newton.ModelBuilder:
     return builder
 
 
-def targets() -> dict[str, Callable[[dict], Callable]]:
-    """Return every function by name, from a world: functions, constructors, methods and settable properties."""
-    found: dict[str, Callable[[dict], Callable]] = {}
+def targets() -> dict[str, Callable[[Callable[[str], Any]], Callable]]:
+    """Return every public function by name: functions, constructors, methods and settable properties.
+
+    Each is got from a function that returns an owner of :data:`OWNERS` by its name.
+    """
+    found: dict[str, Callable[[Callable[[str], Any]], Callable]] = {}
     for name in FUNCTIONS:
-        found[name] = lambda world, name=name: getattr(warpmag, name)
+        found[name] = lambda owned, name=name: getattr(warpmag, name)
     for name in CURVES:
-        found[f"MagnetizationCurve.{name}"] = lambda world, name=name: getattr(warpmag.MagnetizationCurve, name)
-    for owner, make in OWNERS.items():
-        found[owner] = lambda world, owner=owner: CLASSES[owner]
+        found[f"MagnetizationCurve.{name}"] = lambda owned, name=name: getattr(warpmag.MagnetizationCurve, name)
+    for library, module in LIBRARIES.items():
+        for name in ARRAYS:
+            found[f"{library}.{name}"] = lambda owned, module=module, name=name: getattr(module, name)
+    for owner in OWNERS:
+        found[owner] = lambda owned, owner=owner: CLASSES[owner]
         for name, member in vars(CLASSES[owner]).items():
             if name.startswith("_") or name in PASSIVE:
                 continue
             if inspect.isfunction(member):
-                found[f"{owner}.{name}"] = lambda world, make=make, name=name: getattr(make(world), name)
+                found[f"{owner}.{name}"] = lambda owned, owner=owner, name=name: getattr(owned(owner), name)
             elif isinstance(member, property) and member.fset:
-                found[f"{owner}.{name}"] = lambda world, make=make, name=name: _setter(make(world), name)
+                found[f"{owner}.{name}"] = lambda owned, owner=owner, name=name: _setter(owned(owner), name)
     return found
 
 
@@ -143,10 +177,23 @@ def wild(chance: random.Random, world: dict) -> Any:
     if kind == 2:
         return chance.choice(("", "x", "*", "site", "cuda:9", "a" * 5000, "[", b"x", Path("/nowhere"), "\0", "tanh"))
     if kind == 3:
-        return chance.choice((None, object(), [], {}, (), set(), lambda *_: None, int, [[1.0], [2.0, 3.0]], [None]))
+        texts, view = np.array(["1.0", "2", "x"]), memoryview(b"\1\2\3")
+        odd = (
+            texts,
+            texts[0],
+            texts.astype("S"),
+            texts.astype(object),
+            {1.0, 2.0, 3.0},
+            {0: 1.0, 1: 2.0, 2: 3.0},
+            view,
+        )
+        several = (None, object(), [], {}, (), set(), lambda *_: None, int, [[1.0], [2.0, 3.0]], [None])
+        return chance.choice((*several, *odd, range(3), bytearray(3), np.ones(3, bool), np.ones(3, "m8[s]")))
     if kind < 6:
         shape = chance.choice(((), (0,), (1,), (3,), (2, 3), (5, 3), (0, 3), (3, 1), (2, 7), (1, 2, 3), (1000, 3)))
         array = np.full(shape, chance.choice((0.0, 1.0, 1e-9, float(max(min(number, 1e300), -1e300)))))
+        if "torch" in LIBRARIES and chance.random() < 0.2:
+            return LIBRARIES["torch"].torch.tensor(array, requires_grad=chance.random() < 0.3)
         return chance.choice((array, array.astype(np.float32), array.astype("U5"), array[::-1] if shape else array))
     if kind < 9:
         dtype = chance.choice((float, wp.float64, int, wp.vec3, wp.vec3d, wp.quat, wp.transform, wp.spatial_vector))
@@ -181,16 +228,33 @@ class Caller:
     name: str
     seed: int
     world: dict = field(default_factory=new_world)
+    owners: dict[str, Any] = field(default_factory=dict)
+
+    def _owned(self, owner: str) -> Any:
+        """Return an owner of the function, made once for a world."""
+        if owner not in self.owners:
+            self.owners[owner] = OWNERS[owner](self.world)
+        return self.owners[owner]
+
+    def _right(self) -> dict:
+        """Return right arguments of the function by name, and others."""
+        right = self.world | SINGLE.get(self.name, {})
+        if self.name == "Simulation.control":
+            right["control"] = self._owned("Simulation").model.control()
+        if self.name.startswith("torch."):
+            tensor = LIBRARIES["torch"].torch.tensor
+            right |= {name: tensor(value) for name, value in right.items() if isinstance(value, np.ndarray)}
+        return right
 
     def call(self, number: int, announce: Callable[[str], Any] = lambda _: None) -> Outcome:
         """Make one call, and a right one after it; return what became of it."""
         chance = random.Random(f"{self.seed}-{self.name}-{number}")
-        function = targets()[self.name](self.world)
+        function, right = targets()[self.name](self._owned), self._right()
         names = [name for name in inspect.signature(function).parameters if name not in ("args", "options", "overlays")]
         parameters = inspect.signature(function).parameters
         needed = [name for name in names if parameters[name].default is inspect.Parameter.empty]
         needed += [name for name in names if name in USUAL and name not in needed and chance.random() < 0.8]
-        arguments = {name: self.world[name] for name in needed}
+        arguments = {name: right[name] for name in needed}
         for name in chance.sample(names, min(len(names), chance.choice((0, 1, 1, 1, 2, 3)))):
             arguments[name] = wild(chance, self.world)
         outcome = Outcome(number, f"{self.name}({', '.join(f'{k}={_short(v)}' for k, v in arguments.items())})")
@@ -208,7 +272,7 @@ class Caller:
         except BaseException as error:
             if isinstance(error, MemoryError) or not _raised_by(error, arguments):
                 outcome.problem = f"{type(error).__name__}: {error}"[:200] + traceback.format_exc()[-500:]
-        if outcome.taken:
+        if outcome.taken and (names or number % OFTEN == 0):
             self._go_on(outcome)
         return outcome
 
@@ -217,17 +281,23 @@ class Caller:
         try:
             magnetics, state = self.world["magnetics"], self.world["model"].state()
             magnetics.apply(state)
-            if not (np.isfinite(state.body_f.numpy()).all() and np.isfinite(magnetics.b_field(POINTS)).all()):
-                outcome.problem = outcome.problem or "forces and fields are not finite after it"
-        except warpmag.InputError:
+            arrays = [state.body_f.numpy(), magnetics.b_field(POINTS)]
+            if simulation := self.owners.get("Simulation"):
+                simulation.step()
+                arrays.append(simulation.state.body_q.numpy())
+            if not all(np.isfinite(array).all() for array in arrays):
+                outcome.problem = outcome.problem or "forces, fields or poses are not finite after it"
+        except (warpmag.InputError, warpmag.SimulationError):
             pass
         except BaseException as error:
             outcome.problem = outcome.problem or f"later {type(error).__name__}: {error}"[:300]
-        self.world = new_world()
+        self.world, self.owners = new_world(), {}
 
 
 def _raised_by(error: BaseException, arguments: dict) -> bool:
-    """Return True for the error of a function that was an argument."""
+    """Return True for the error of a function that was an argument, and for an ``InputError`` that JAX passes on."""
+    if type(error).__name__ == "JaxRuntimeError" and "InputError: " in str(error):
+        return True
     code = [value.__code__ for value in arguments.values() if inspect.isfunction(value)]
     return any(frame.f_code in code for frame, _ in traceback.walk_tb(error.__traceback__))
 
@@ -236,6 +306,8 @@ def _numbers(result: Any) -> Iterator[np.ndarray]:
     for part in result if isinstance(result, tuple | list) else [result]:
         if isinstance(part, wp.array) and part.dtype in (wp.float32, wp.vec3):
             yield part.numpy()
+        elif hasattr(part, "detach"):
+            yield part.detach().numpy()
         elif isinstance(part, np.ndarray | float):
             yield np.asarray(part)
 

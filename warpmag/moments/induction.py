@@ -287,6 +287,16 @@ class _Balls:
         return system
 
 
+def permanent_dipoles(permanent) -> tuple[Any, Any]:
+    """Return positions and moments of the argument ``permanent``, of no dipoles if it is None."""
+    if permanent is None:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    if not isinstance(permanent, (tuple, list)) or len(permanent) != 2:
+        raise InputError(f"permanent: must be (positions, moments), got {short_repr(permanent)}")
+    positions, moments = permanent
+    return positions, moments
+
+
 def _read_balls(context: CallContext, positions, radii, external_field, permanent) -> _Balls:
     """Return the checked arrays of :func:`solve_induction`."""
     radii = host_radii("radii", radii, context.dtype)
@@ -297,12 +307,9 @@ def _read_balls(context: CallContext, positions, radii, external_field, permanen
     if not (radii > 0.0).all():
         raise InputError(f"radii: must be positive, got {radii.min():g}")
     applied_field = context.vectors("external_field", (0.0, 0.0, 0.0) if external_field is None else external_field, n)
-    if permanent is None:
-        permanent = np.zeros((0, 3)), np.zeros((0, 3))
-    if not isinstance(permanent, (tuple, list)) or len(permanent) != 2:
-        raise InputError(f"permanent: must be (positions, moments), got {short_repr(permanent)}")
-    dipoles = context.vectors("permanent: positions", permanent[0], farthest=farthest)
-    moments = context.vectors("permanent: moments", permanent[1], dipoles.shape[0])
+    dipoles, moments = permanent_dipoles(permanent)
+    dipoles = context.vectors("permanent: positions", dipoles, farthest=farthest)
+    moments = context.vectors("permanent: moments", moments, dipoles.shape[0])
     return _Balls(x, radii, applied_field, dipoles, moments)
 
 

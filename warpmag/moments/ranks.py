@@ -29,7 +29,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from warpmag.declarations.checks import check_count
+from warpmag.declarations.checks import check_count, short_repr
 from warpmag.errors import InputError, SimulationError, extra, one_line
 
 _COUNTS = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MV2_COMM_WORLD_SIZE")
@@ -134,14 +134,16 @@ def sweep(simulate: Callable[[range], _R], world_count: int, *, together: int) -
         The result of each group, in the order of worlds; the same on all ranks.
 
     Raises:
-        InputError: ``world_count`` or ``together`` is not a whole number from 1 on, or differs between ranks. An error
-            of ``simulate`` on one rank is raised on all ranks.
+        InputError: ``simulate`` is no function; ``world_count`` or ``together`` is not a whole number from 1 on, or
+            differs between ranks. An error of ``simulate`` on one rank is raised on all ranks.
 
     Example:
         >>> import warpmag
         >>> warpmag.sweep(lambda worlds: [world**2 for world in worlds], 5, together=2)
         [[0, 1], [4, 9], [16]]
     """
+    if not callable(simulate):
+        raise InputError(f"simulate: must be a function, got {short_repr(simulate)}")
     check_count("world_count", world_count)
     check_count("together", together)
     groups = [range(first, min(first + together, world_count)) for first in range(0, world_count, together)]
