@@ -14,6 +14,7 @@ import argparse
 import inspect
 import json
 import math
+import multiprocessing
 import os
 import random
 import resource
@@ -23,6 +24,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -372,18 +374,27 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="which calls (default: %(default)s)")
     parser.add_argument("--only", default="", help="part of the names of the functions")
     parser.add_argument("--without", default="-", help="part of the names of functions that are left out")
+    parser.add_argument("--workers", type=int, default=1, help="functions at a time (default: %(default)s)")
     options = parser.parse_args()
     new_world()  # kernels are compiled before the first fork
+    names = [name for name in targets() if options.only in name and options.without not in name]
+    calls = partial(_all_outcomes, seed=options.seed, count=options.count)
     total = 0
-    for name in (target for target in targets() if options.only in target and options.without not in target):
-        results = list(outcomes(name, options.seed, list(range(options.count))))
-        bad = [outcome for outcome in results if outcome.problem]
-        total += len(bad)
-        print(f"{name:40} {sum(outcome.taken for outcome in results):6} taken {len(bad):6} problems", flush=True)
-        for outcome in bad[:5]:
-            print(f"    {outcome.number}: {outcome.call[:300]}\n        {outcome.problem}", flush=True)
-    print(f"{total} problems")
+    with multiprocessing.get_context("fork").Pool(options.workers) as pool:
+        for name, results in pool.imap_unordered(calls, names):
+            bad = [outcome for outcome in results if outcome.problem]
+            total += len(bad)
+            taken = sum(outcome.taken for outcome in results)
+            print(f"{name:36} {len(results):6} calls {taken:6} taken {len(bad):6} problems", flush=True)
+            for outcome in bad[:5]:
+                print(f"    {outcome.number}: {outcome.call[:300]}\n        {outcome.problem}", flush=True)
+    print(f"{len(names)} functions, {total} problems")
     return 1 if total else 0
+
+
+def _all_outcomes(name: str, seed: int, count: int) -> tuple[str, list[Outcome]]:
+    """Return the name of a function and :func:`outcomes` of its first ``count`` calls."""
+    return name, list(outcomes(name, seed, list(range(count))))
 
 
 if __name__ == "__main__":
