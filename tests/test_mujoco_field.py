@@ -31,6 +31,9 @@ def test_the_field_of_an_mjcf_magnetizes_iron(device):
     with pytest.warns(UserWarning, match=r"the option magnetic of MuJoCo, \(0, 0, 0.02\) T, becomes the ext") as caught:
         magnetics = warpmag.Magnetics(model)
     assert caught[0].filename == __file__
+    with pytest.warns(UserWarning, match="magnetic of MuJoCo") as caught:
+        warpmag.Simulation(imported(f"<option magnetic='0 0 {B}'/>"), device=device)
+    assert caught[0].filename == __file__  # as deep as it may be
     magnetics.apply(model.state())
     moment = 1.7e6 * math.tanh(3.0 * B / MU0 / 1.7e6) * 4.0 / 3.0 * math.pi * 0.005**3
     np.testing.assert_allclose(magnetics.sum_moments().numpy(), [[0.0, 0.0, moment]], rtol=2e-3, atol=1e-6)  # rtol 1e-3

@@ -1,11 +1,11 @@
 """Earlier spellings of arguments, which still work and warn with the present one."""
 
-import warnings
 from collections.abc import Callable
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar, cast
 
 from warpmag.declarations.checks import short_repr
+from warpmag.errors import warn_caller
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -28,7 +28,7 @@ def renamed_arguments(**present: str) -> Callable[[Callable[Parameters, Result]]
                 if name in values:
                     raise TypeError(f"{owner}() got {name} and its earlier name {earlier}")
                 message = f"{owner}: {earlier} is deprecated, use {name}"
-                warnings.warn(message, DeprecationWarning, stacklevel=2)
+                warn_caller(message, DeprecationWarning)
                 values[name] = values.pop(earlier)
             return cast(Any, function)(*positions, **values)
 
@@ -53,7 +53,7 @@ def keyword_arguments(*names: str) -> Callable[[Callable[Parameters, Result]], C
                 name = function.__name__
                 spelled = ", ".join(f"{argument}={short_repr(value)}" for argument, value in given.items())
                 message = f"{name}: name the {', '.join(given)}, {name}(builder, {spelled}, ...)"
-                warnings.warn(message, DeprecationWarning, stacklevel=2)
+                warn_caller(message, DeprecationWarning)
             return call(builder, *positions[len(given) :], **{**given, **values})
 
         return cast(Any, named)

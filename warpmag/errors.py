@@ -1,5 +1,10 @@
 """Errors and warnings of the library."""
 
+import re
+import sys
+import warnings
+from types import FrameType
+
 _BEGIN, _END = 400, 200
 """Characters kept at the start and at the end of a long message."""
 
@@ -14,6 +19,19 @@ def one_line(text: str) -> str:
 def extra(name: str) -> str:
     """Return the name of an extra of the package and the commands that install it, for an error message."""
     return f"the extra '{name}' (in a checkout pip install '.[{name}]', or uv run --extra {name} ...)"
+
+
+_OWN_MODULES = re.compile(r"(warpmag|warp|contextlib)\b(?!\.examples)")
+"""Modules whose lines are no user's: warpmag, and those that call it on its behalf."""
+
+
+def warn_caller(text: str, category: type[Warning] = UserWarning) -> None:
+    """Warn with the line of the user's program that called warpmag, however deep the cause is."""
+    frame: FrameType | None = sys._getframe(1)
+    level = 2
+    while frame is not None and _OWN_MODULES.match(frame.f_globals.get("__name__", "")):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(text, category, stacklevel=level if frame is not None else 2)
 
 
 class InputError(ValueError):

@@ -1,8 +1,6 @@
 """Warnings of values that were likely meant in another unit."""
 
-import warnings
-
-from warpmag.errors import UnitWarning
+from warpmag.errors import UnitWarning, warn_caller
 
 _STRENGTHS = 1e3, 2e6
 """Magnetization of permanent magnets [A/m]: flexible ferrite has 1e5, NdFeB 1.2e6."""
@@ -10,8 +8,6 @@ _STRONGEST_REMANENCE = 3.0
 """Number up to which a magnetization is likely a remanence [T]; that of NdFeB is 1.5."""
 _LARGEST_BALL = 0.5
 """Radius [m] from which that of a magnetic ball is likely in another unit."""
-_CALLER = 4
-"""Frames from ``warnings.warn`` to the caller of a public function: this module, the function, its decorator."""
 
 
 def warn_of_magnetization(magnetization: float) -> None:
@@ -22,11 +18,11 @@ def warn_of_magnetization(magnetization: float) -> None:
     remanence = f"; for {magnetization:g} T give remanence={magnetization:g} and a direction"
     meant = remanence if magnetization <= _STRONGEST_REMANENCE else ""
     text = f"magnetization: {magnetization:g} A/m is none of a permanent magnet ({least:g} to {most:g} A/m){meant}"
-    warnings.warn(text, UnitWarning, stacklevel=_CALLER)
+    warn_caller(text, UnitWarning)
 
 
 def warn_of_radius(name: str, radius: float) -> None:
     """Warn of a magnetic ball of a very large radius [m]."""
     if radius >= _LARGEST_BALL:
         text = f"{name}: a magnetic ball of radius {radius:g} m; lengths are in meters, 5 mm are 0.005"
-        warnings.warn(text, UnitWarning, stacklevel=_CALLER)
+        warn_caller(text, UnitWarning)

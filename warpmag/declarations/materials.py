@@ -7,14 +7,13 @@ Densities are rounded values from Bozorth's table and makers' data sheets.
 """
 
 import math
-import warnings
 from dataclasses import dataclass
 
 from warpmag.declarations.checks import check_positive, real_number, short_repr, vector
 from warpmag.declarations.curves import MU0, MagnetizationCurve
 from warpmag.declarations.magnets import check_curve
 from warpmag.declarations.measured import MEASURED_CURVES
-from warpmag.errors import InputError
+from warpmag.errors import InputError, warn_caller
 
 _BOZORTH = (
     "R. M. Bozorth, Ferromagnetism, 1951, table of magnetic materials: permeability at 2 mT, saturation, resistivity"
@@ -164,7 +163,7 @@ def magnetization_from(magnetization, remanence, material, direction) -> tuple[f
     """
     if material is not None and direction is None and magnetization is not None:
         message = f"material: its direction is an argument of its own now, direction={short_repr(magnetization)}"
-        warnings.warn(message, DeprecationWarning, stacklevel=4)
+        warn_caller(message, DeprecationWarning)
         magnetization, direction = None, magnetization
     strengths = {"magnetization": magnetization, "remanence": remanence, "material": material}
     given = [name for name, value in strengths.items() if value is not None]

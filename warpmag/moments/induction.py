@@ -1,7 +1,6 @@
 """Magnetic equilibrium of inducible balls in one call on arrays."""
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,7 +12,7 @@ import warp as wp
 from warpmag.declarations.checks import short_repr
 from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.materials import measured
-from warpmag.errors import ConvergenceWarning, InputError
+from warpmag.errors import ConvergenceWarning, InputError, warn_caller
 from warpmag.moments.arrays import (
     LEAST_FORCE_MOMENT,
     CallContext,
@@ -218,7 +217,7 @@ def solve_induction(
         30000.0
     """
     if sources is not None:
-        warnings.warn("solve_induction: sources is deprecated, use permanent", DeprecationWarning, stacklevel=3)
+        warn_caller("solve_induction: sources is deprecated, use permanent", DeprecationWarning)
         permanent = sources if permanent is None else permanent
     settings = SolverSettings(
         dynamics=dynamics, contact_model=contact_model, method=method, rtol=rtol, max_evaluations=max_evaluations,
@@ -356,11 +355,11 @@ def _read_result(context: CallContext, system: MomentSystem, balls: _Balls, argu
     if not converged:
         limit = system.settings.max_evaluations
         text = f"error {error:.2g} > rtol {system.rtol:g} after max_evaluations = {limit}"
-        warnings.warn(f"solve_induction: did not converge, {text}", ConvergenceWarning, stacklevel=4)
+        warn_caller(f"solve_induction: did not converge, {text}", ConvergenceWarning)
     field_error = system.field_error()
     if field_error > system.rtol:
         text = f"solve_induction: fields have an error of {field_error:.2g} > rtol {system.rtol:g}; use method direct"
-        warnings.warn(text, ConvergenceWarning, stacklevel=4)
+        warn_caller(text, ConvergenceWarning)
     evaluations = int(system.evaluations.numpy().max(initial=0))
     return InductionResult(m, h, error, evaluations, converged, field_error, system, context, arguments, balls)
 

@@ -23,12 +23,11 @@ one field evaluation an iteration (``kernels.induction.tangent``). Gradients by 
 """
 
 import math
-import warnings
 
 import numpy as np
 import warp as wp
 
-from warpmag.errors import ConvergenceWarning, InputError
+from warpmag.errors import ConvergenceWarning, InputError, warn_caller
 from warpmag.kernels.applied.coil_gradients import CoilGradients
 from warpmag.kernels.applied.sources import FieldSources
 from warpmag.kernels.induction.tangent import Tangent
@@ -199,7 +198,7 @@ class SystemGradients:
             raise InputError("induction: the gradient of the loss by the magnetizations or the field is not finite")
         if ratio > 0.0:
             text = f"gradient of the induction: residual {ratio * self._rtol:.2g} > rtol {self._rtol:g}"
-            warnings.warn(text, ConvergenceWarning, stacklevel=2)
+            warn_caller(text, ConvergenceWarning)
 
 
 class _MultipoleGradients:

@@ -1,14 +1,10 @@
 """External field of a model that was imported from MJCF."""
 
-import warnings
-
 import newton
 import numpy as np
 
 from warpmag.declarations.mujoco_field import external_fields, field_message
-
-_CALLER = 5
-"""Frames from ``warnings.warn`` to the caller of ``Magnetics``: this function, the constructor, its decorators."""
+from warpmag.errors import warn_caller
 
 
 def imported_field(model: newton.Model) -> np.ndarray | None:
@@ -23,5 +19,5 @@ def imported_field(model: newton.Model) -> np.ndarray | None:
     fields = external_fields(flux.numpy())
     if not fields.any():
         return None
-    warnings.warn(f"{field_message(fields)}; external_field= sets another", UserWarning, stacklevel=_CALLER)
+    warn_caller(f"{field_message(fields)}; external_field= sets another")
     return fields

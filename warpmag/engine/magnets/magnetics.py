@@ -1,6 +1,5 @@
 """Magnetic forces on the bodies of a Newton model."""
 
-import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -24,7 +23,7 @@ from warpmag.engine.magnets.model_values import ModelValues, magnetic_arrays
 from warpmag.engine.magnets.pose_gradients import ForceGradients
 from warpmag.engine.magnets.sources import ModelSources
 from warpmag.engine.magnets.world_reset import WorldMask, WorldRows
-from warpmag.errors import ConvergenceWarning, InputError
+from warpmag.errors import ConvergenceWarning, InputError, warn_caller
 from warpmag.kernels.rigid.bodies import (
     BodyMoments,
     add_wrenches,
@@ -321,7 +320,7 @@ class Magnetics:
             if tape is not None:
                 self._gradients.record(tape, state)
         if self.device.is_cpu and not self.device.is_capturing:
-            self._warn_unconverged(level=3)
+            self._warn_unconverged()
 
     def induce(self, state: newton.State, dt: float | None = None, *, sharing: wp.array | None = None) -> None:
         """Solve the induction at the poses of ``state``, starting from the last magnetizations.
@@ -558,25 +557,25 @@ class Magnetics:
 
     def _measured_probe(self, points, worlds, *, gradients: bool = False) -> FieldProbe:
         """Return a probe of the points with the present field."""
-        self._check_solved(level=5)
+        self._check_solved()
         probe = self.probe(points, worlds=worlds, gradients=gradients)
         self.check_model()
         probe.measure()
         return probe
 
-    def _check_solved(self, level: int = 4) -> None:
+    def _check_solved(self) -> None:
         """Raise :class:`InputError` before the first solve, warn if the last one did not converge."""
         if not self._induced:
             raise InputError("Magnetics: there is no field yet, call apply(state) or induce(state) first")
-        self._warn_unconverged(level)
+        self._warn_unconverged()
 
-    def _warn_unconverged(self, level: int) -> None:
-        """Warn if the last solve did not converge, at the caller ``level`` calls above; waits for the device."""
+    def _warn_unconverged(self) -> None:
+        """Warn if the last solve did not converge; waits for the device."""
         if self.converged.numpy().all():
             return
         error, limit = float(self.error.numpy().max()), self.system.settings.max_evaluations
         text = f"Magnetics: did not converge, error {error:.2g} > rtol {self.rtol:g} after max_evaluations = {limit}"
-        warnings.warn(text, ConvergenceWarning, stacklevel=level)
+        warn_caller(text, ConvergenceWarning)
 
     def energy(self) -> np.ndarray:
         """Return the present energy of the magnets of each world [J], shape [worlds]; 0 for a world without magnets.
@@ -625,7 +624,7 @@ class Magnetics:
         try:
             self.induce(state)
             self.check_model()
-            self._warn_unconverged(level=3)
+            self._warn_unconverged()
             return self.sum_moments().numpy().copy()
         finally:
             restore()

@@ -1,12 +1,11 @@
 """Checks a stage for ``warpmag check``: its contents, its errors, and the findings of USD's own validators."""
 
 import os
-import warnings
 from dataclasses import dataclass, replace
 
 from pxr import Tf, Usd, UsdGeom, UsdValidation
 
-from warpmag.errors import InputError
+from warpmag.errors import InputError, warn_caller
 from warpmag.usd.read.ball_instancers import BallInstancer, ball_instancers
 from warpmag.usd.read.clock import StageClock, stage_clock, stage_name
 from warpmag.usd.read.input_errors import usd_errors
@@ -50,7 +49,7 @@ class StageReport:
         """Return the unit of length under its earlier name."""
         if name == "metres_per_unit":
             message = "StageReport.metres_per_unit is deprecated, use meters_per_unit"
-            warnings.warn(message, DeprecationWarning, stacklevel=2)
+            warn_caller(message, DeprecationWarning)
             return self.meters_per_unit
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
