@@ -1,5 +1,6 @@
 """The command: what it prints, what it writes, how it ends."""
 
+import io
 import os
 import re
 import shlex
@@ -17,6 +18,7 @@ from pxr import Gf, Usd, UsdGeom, UsdPhysics
 from warpmag import cli
 from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.declarations.materials import MATERIALS
+from warpmag.progress import Progress, Waiting
 from warpmag.scenes_usd import balls_up
 from warpmag.usd import author_magnet, author_settings
 
@@ -399,3 +401,28 @@ def test_check_ends_with_a_verdict(scene, tmp_path, capsys):
     ):
         assert cli.main(["check", str(edited(scene, tmp_path / "edited.usda", edit))]) == code
         assert capsys.readouterr().out.splitlines()[-1] == f"verdict     {verdict}"
+
+
+class Terminal(io.StringIO):
+    """A stderr that is a terminal."""
+
+    def isatty(self):
+        return True
+
+
+def test_a_line_shows_from_the_first_second_that_a_stage_loads(monkeypatch):
+    monkeypatch.setattr("sys.stderr", terminal := Terminal())
+    Waiting("scene: loading")
+    assert "scene: loading, 00:00" in terminal.getvalue()
+    time.sleep(1.7)
+    assert "scene: loading, 00:01" in terminal.getvalue()
+    Progress.interrupt("scene: compiling kernels")
+    assert "scene: compiling kernels\n" in terminal.getvalue()
+    progress = Progress(10)
+    progress.show(0)  # the bar replaces the line
+    shown = len(terminal.getvalue())
+    time.sleep(0.7)
+    assert "loading" not in terminal.getvalue()[shown:]
+    assert "0/10" in terminal.getvalue()
+    progress.close()
+    Waiting.end()

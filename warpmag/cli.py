@@ -15,7 +15,7 @@ from warpmag.declarations.materials import MATERIALS
 from warpmag.errors import InputError, SimulationError, one_line
 from warpmag.kernel_loading import watch_kernels
 from warpmag.moments.ranks import Ranks, current_ranks, is_first_rank, on_first_rank, without_ranks
-from warpmag.progress import Progress
+from warpmag.progress import Progress, Waiting
 from warpmag.stopwatch import Stopwatch, process_age
 from warpmag.terminal import (
     Stopped,
@@ -47,6 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
         log(error)
         return BAD_INPUT
     code, line = _execute(arguments, all_ranks, stopwatch)
+    Waiting.end()
     if line and all_ranks is not None:
         all_ranks.fail(line, code, log)
     elif line:
@@ -200,16 +201,18 @@ def _load(path: Path, **options):
     _start_warp(path)
     from warpmag.engine.stepping.simulation import Simulation  # noqa: PLC0415
 
-    return Simulation(path, **options)
+    simulation = Simulation(path, **options)
+    Waiting.end()
+    return simulation
 
 
 def _start_warp(path: Path) -> None:
-    """Initialize Warp; on a terminal, print that the stage is loading. Call this before the engine is imported.
+    """Initialize Warp; on a terminal, show that the stage is loading. Call this before the engine is imported.
 
     A compilation of kernels is announced before it begins, on a terminal or not.
     """
-    if sys.stderr.isatty():
-        _status(f"{path.stem}: loading")
+    if is_first_rank(current_ranks()):
+        Waiting(f"{path.stem}: loading")
     quiet_warp()
     watch_kernels(lambda: _status(f"{path.stem}: compiling kernels, once for this version, for a minute or two"))
 
@@ -238,6 +241,7 @@ def _render(options) -> int:
     frames = _pair("frames", options.frames, ":") if options.frames is not None else None
     settings = {name: getattr(options, name) for name in ("arrows", "camera", "device", "frame")}
     settings |= {"size": _pair("size", options.size, "x"), "frames": frames}
+    Waiting.end()
     written = render(path, options.output, **settings, on_camera=lambda line: print(f"drawn   {line}"))
     print(f"written {written[0]}{f' to {written[-1].name}' if len(written) > 1 else ''}")
     return 0
@@ -257,6 +261,7 @@ def _export(options) -> int:
     from warpmag.show.export import export  # noqa: PLC0415
 
     names = ("fps", "color", "arrows", "field_lines", "materialx", "device")
+    Waiting.end()
     for line in export(path, options.output, **{name: getattr(options, name) for name in names}):
         print(line)
     print(f"written {options.output}")
@@ -334,6 +339,8 @@ def _simulate(simulation, output: Path, options, display, *, copy_scene: bool, r
             progress.show(frame)
         return display is None or display.follow(simulation.time, simulation.state)
 
+    if is_first_rank(current_ranks()):
+        Waiting("first frame")
     try:
         statistics = simulation.run(progress.frames, output=output, copy_scene=copy_scene, resume=resume, on_frame=show)
     finally:
