@@ -8,6 +8,7 @@ from pxr import Usd, UsdGeom
 from small_builders import new_builder
 
 import warpmag
+from warpmag.declarations.coils import SourceRecord
 from warpmag.engine.stepping.scene import import_scene
 
 SHAPES = {
@@ -85,6 +86,75 @@ def test_its_stage_has_the_bodies_of_the_model(run, device):
         forces.append(state.body_f.numpy())
     expected, read = (rows / np.abs(forces[0]).max(axis=0) for rows in forces)
     np.testing.assert_allclose(read, expected, atol=0.02)
+
+
+def jointed(builder):
+    """Add a pendulum, a slider with a drive, a ball on a string, and a coil on a body, beside a coil and a map."""
+    turned = wp.quat_from_axis_angle(wp.normalize(wp.vec3(1.0, 2.0, 3.0)), 0.7)
+    bodies = []
+    for number, kind in enumerate(("pendulum", "slider", "string", "hanger", "welded")):
+        body = builder.add_link(xform=wp.transform((0.1 * number, 0.0, 0.0), turned), label=kind)
+        builder.add_shape_sphere(body, radius=0.005)
+        warpmag.add_permanent(builder, body=body, magnetization=(0.0, 0.0, 1e5))
+        bodies.append(body)
+    pendulum, slider, string, hanger, welded = bodies
+    end = {"child_xform": wp.transform((0.02, 0.0, 0.01), turned)}
+    at = [wp.transform_multiply(builder.body_q[body], end["child_xform"]) for body in bodies]
+    drive = {"target_ke": 30.0, "target_kd": 0.5, "target_q": 0.004, "limit_lower": -0.01, "limit_upper": 0.02}
+    joints = [
+        builder.add_joint_revolute(-1, pendulum, parent_xform=at[0], axis=(0.6, 0.8, 0.0), limit_upper=2.0, **end),
+        builder.add_joint_prismatic(-1, slider, parent_xform=at[1], axis=(0.0, 0.6, 0.8), **drive, **end),
+        builder.add_joint_distance(-1, string, parent_xform=at[2], min_distance=-1.0, max_distance=0.01, **end),
+        builder.add_joint_ball(-1, hanger, parent_xform=at[3], **end),
+        builder.add_joint_fixed(-1, welded, parent_xform=at[4], **end),
+    ]
+    for joint in joints:
+        builder.add_articulation([joint])
+    pose = wp.transform((0.01, 0.0, 0.02), turned)
+    warpmag.add_coil(builder, body=slider, radius=0.01, ampere_turns=3.0, xform=pose, label="lift")
+    warpmag.add_coil(builder, shape="solenoid", radius=0.01, length=0.02, resistance=2.0, voltage=1.0, turns=30)
+    warpmag.add_coil(builder, shape="polyline", points=[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    values = np.random.default_rng(1).normal(size=(2, 3, 4, 3))
+    warpmag.add_field_map(builder, origin=(-1.0, -1.0, -1.0), spacing=1.0, values=values, factor=0.5)
+    return builder
+
+
+def test_its_stage_has_joints_and_coils(device, tmp_path):
+    """They were left out. Read back, the motion and the sources are those of the builder."""
+    builder = jointed(new_builder())
+    simulation = warpmag.Simulation(builder, device=device)
+    simulation.run(20, output=tmp_path / "out.usda")
+    again = warpmag.Simulation(tmp_path / "out.scene.usdc", device=device, dt=1e-3)
+    for _ in range(round(20 / 60 / 1e-3)):
+        again.step()
+    first, read = (run.state.body_q.numpy() for run in (simulation, again))
+    assert np.abs(first[:4] - simulation.model.body_q.numpy()[:4]).max(axis=1).min() > 2e-3  # all but one have moved
+    np.testing.assert_allclose(read, first, atol=2e-4)  # frames are rounded, and XPBD iterates
+    sources = []
+    for model in (simulation.model, again.model):
+        shapes = [shape for shape, text in enumerate(model.warpmag.source) if text]
+        order = sorted(shapes, key=lambda shape: model.shape_label[shape].rpartition("/")[2])
+        sources.append([SourceRecord.from_text(model.warpmag.source[shape]) for shape in order])
+    assert len(sources[1]) == 4
+    for record, expected in zip(*sources[::-1], strict=True):
+        assert (record.kind, record.circuit) == (expected.kind, expected.circuit)
+        np.testing.assert_allclose(record.parameters, expected.parameters, rtol=1e-6)
+        np.testing.assert_allclose(record.table, expected.table, rtol=1e-5, atol=1e-6)
+    currents = [run.magnetics.coils.currents.numpy()[0] for run in (simulation, again)]
+    assert currents[1] == pytest.approx(currents[0], rel=1e-4) and currents[0] > 0.4
+
+
+def test_joints_that_a_stage_lacks_are_named(device, tmp_path):
+    builder = new_builder()
+    body = builder.add_link(label="ball")
+    builder.add_shape_sphere(body, radius=0.005)
+    warpmag.add_inducible(builder, body=body)
+    axes = [newton.ModelBuilder.JointDofConfig(axis=axis) for axis in (newton.Axis.X, newton.Axis.Y)]
+    builder.add_articulation([builder.add_joint_d6(-1, body, linear_axes=axes, label="table")])
+    simulation = warpmag.Simulation(builder, device=device)
+    with pytest.warns(UserWarning, match="table: the output has no d6 joints") as caught:
+        simulation.run(1, output=tmp_path / "out.usda")
+    assert caught[0].filename == __file__
 
 
 def test_what_cannot_be_written_is_named(device, tmp_path):

@@ -101,6 +101,22 @@ class SourceRecord:
         fields = {"kind": self.kind, "parameters": self.parameters, "table": table}
         return json.dumps(fields if self.circuit is None else fields | {"circuit": self.circuit})
 
+    def declared(self, strength: float, voltage: float = 0.0) -> "Coil | FieldMap":
+        """Return the coil or the field map of this record, with a strength and a voltage."""
+        p = self.parameters
+        if self.kind == "field_map":
+            counts = tuple(int(count) for count in p[6:9])
+            nodes = self.table.reshape(*(count + 2 for count in counts), 3)[1:-1, 1:-1, 1:-1]
+            return FieldMap(p[:3], p[3:6], nodes, strength)
+        turns, resistance, inductance = self.circuit or (1.0, 0.0, 0.0)
+        driven = {"resistance": resistance, "voltage": voltage, "turns": turns, "inductance": inductance}
+        shared = {"wire_radius": p[-1], "ampere_turns": strength, **driven}
+        if self.kind == "polyline":
+            closed = len(self.table) > 3 and bool((self.table[0] == self.table[-1]).all())
+            corners = self.table[:-1] if closed else self.table
+            return Coil("polyline", points=tuple(map(tuple, corners.tolist())), closed=closed, **shared)
+        return Coil(self.kind, radius=p[0], length=2.0 * p[1] if self.kind == "solenoid" else 0.0, **shared)
+
     @classmethod
     def from_text(cls, text: str) -> "SourceRecord":
         """Return the record of a line that :meth:`to_text` wrote."""

@@ -38,6 +38,15 @@ def reverse_targets(builder: newton.ModelBuilder, joint: int, axis: int) -> None
         getattr(builder, name)[axis] *= -1.0
 
 
+def drive_target(model: newton.Model, joint: int, axis: int) -> tuple[float, float]:
+    """Return the target position and velocity of the drive of a joint with the one degree of freedom ``axis``."""
+    if hasattr(model, "joint_target_q"):
+        position = model.joint_target_q.numpy()[model.joint_q_start.numpy()[joint]]
+        return float(position), float(model.joint_target_qd.numpy()[axis])
+    old: Any = model  # before 1.8
+    return float(old.joint_target_pos.numpy()[axis]), float(old.joint_target_vel.numpy()[axis])
+
+
 def has_joint_kernels(solver: newton.solvers.SolverXPBD) -> bool:
     """Return True if a solver has the joints of 1.8, whose kernels warpmag launches; and no mimic joints."""
     return not getattr(solver, "_has_joint_mimics", True)

@@ -22,13 +22,14 @@ from warpmag.usd.read.prims import has_volume
 from warpmag.usd.read.recording import Playback, Recording, read_recording
 from warpmag.usd.read.survey import StageContents, read_magnets, survey
 from warpmag.usd.values import Finding, quiet
+from warpmag.usd.write.model_joints import StageDrive, StageJoint
 from warpmag.usd.write.model_stage import ModelStage, StageBody, StageShape
 from warpmag.usd.write.writer import CacheWriter, PreviousRun
 
 __all__ = [
     "MOMENTS_PRIMVAR", "BallFrames", "BallInstancer", "CacheWriter", "Finding", "GroundedJoint", "IdenticalBalls",
-    "ModelStage", "Playback", "PreviousRun", "Recording", "StageBody", "StageClock", "StageContents", "StageReport",
-    "StageShape", "author_coil",
+    "ModelStage", "Playback", "PreviousRun", "Recording", "StageBody", "StageClock", "StageContents", "StageDrive",
+    "StageJoint", "StageReport", "StageShape", "author_coil",
     "author_field_map", "author_magnet", "author_settings", "ball_instancers", "check", "collider_magnet",
     "complete_instances", "describe", "enabled_joint_paths", "freeze", "give_densities", "has_volume", "inspect",
     "is_source", "magnet_of", "newton_errors", "open_animated", "open_deferred", "open_stage", "perspective_cameras",

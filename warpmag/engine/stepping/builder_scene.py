@@ -5,9 +5,12 @@ from typing import Any
 import newton
 import numpy as np
 
+from warpmag.declarations.attributes import NAMESPACE
+from warpmag.declarations.coils import SourceRecord
 from warpmag.declarations.keys import SceneKeys
 from warpmag.declarations.magnets import MagneticSettings, StageMagnets
 from warpmag.engine.magnets.attributes import marked_shapes
+from warpmag.engine.stepping.builder_joints import stage_joints
 from warpmag.engine.stepping.scene import ImportedScene
 from warpmag.errors import InputError
 from warpmag.usd import ModelStage, StageBody, StageShape, stage_clock
@@ -29,7 +32,7 @@ def builder_scene(
 ) -> ImportedScene:
     """Return a scene of the bodies, shapes and magnets of ``model`` at ``state``.
 
-    Joints, coils and field maps are not in it: a run of a builder can be drawn, but is not continued from its stage.
+    A stage lacks joints of more than one axis, and passive springs. So it can be drawn and run, but is not resumed.
 
     Raises:
         InputError: A shape has a type that stages cannot have, such as a height field.
@@ -45,6 +48,10 @@ def builder_scene(
     for shape in shown:
         made.add_shape(_stage_shape(model, shape, magnets.get(shape), float(np.abs(poses[:, :3]).max(initial=0.05))))
     paths = dict(zip(shown, made.shapes, strict=True))
+    joints, warnings = stage_joints(model)
+    for joint in joints:
+        made.add_joint(joint)
+    _add_sources(made, model)
     return ImportedScene(
         opened=made.stage,
         identical_balls=[],
@@ -54,8 +61,20 @@ def builder_scene(
         bodies=dict(zip(made.bodies, range(model.body_count), strict=True)),
         magnet_shapes={paths[shape]: [shape] for shape in magnets},
         keys=SceneKeys({}, {}, {}, {}),
-        warnings=(),
+        warnings=tuple(warnings),
     )
+
+
+def _add_sources(made: ModelStage, model: newton.Model) -> None:
+    """Add the coils and the field maps of a model to a stage."""
+    attributes = getattr(model, NAMESPACE)
+    strengths, voltages = attributes.strength.numpy(), attributes.voltage.numpy()
+    for shape in [shape for shape, text in enumerate(attributes.source) if text]:
+        source = SourceRecord.from_text(attributes.source[shape]).declared(
+            float(strengths[shape]), float(voltages[shape])
+        )
+        body, pose = int(model.shape_body.numpy()[shape]), model.shape_transform.numpy()[shape]
+        made.add_source(source, model.shape_label[shape], body, pose)
 
 
 def _is_visible(model: newton.Model, shape: int) -> bool:

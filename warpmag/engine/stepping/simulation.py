@@ -29,7 +29,7 @@ from warpmag.engine.stepping.model_checks import (
 )
 from warpmag.engine.stepping.statistics import Statistics, find_held
 from warpmag.engine.stepping.stepper import Stepper
-from warpmag.errors import InputError, SimulationError
+from warpmag.errors import InputError, SimulationError, warn_caller
 from warpmag.kernel_loading import kernel_seconds
 from warpmag.moments.arrays import resolve_device
 from warpmag.moments.ranks import current_ranks, errors_on_all_ranks
@@ -392,7 +392,7 @@ class Simulation:
 
         Args:
             frames: Output frames after the first; by default the whole stage, else one second.
-            output: USD file to write. For a builder it has bodies, shapes and magnets, not joints, coils or field maps.
+            output: USD file to write. A builder's lacks passive springs and, with a warning, joints of several axes.
             copy_scene: Copy the scene beside the output instead of referencing it. A scene with unsaved edits is always
                 copied.
             resume: Continue the run at the output, if there is one; scene and options must be the same. On a CPU the
@@ -483,6 +483,8 @@ class Simulation:
             field = self._magnetics.external_field.numpy()[0].tolist()  # of the first world
             settings = self._settings.replaced(external_field=tuple(field))
             scene = builder_scene(self._builder, self.model, self.state, settings, self.frame_rate)
+            for line in scene.warnings:
+                warn_caller(line)
         options = {"copy_scene": copy_scene, "frames": frames + 1, "options": self._options, "ranks": self._ranks}
         options["resumable"] = SOLVERS[self._options["solver"]].resumable and self._scene is not None
         return Recorder(scene, self._magnetics, self._stepper, self._statistics, output, **options)

@@ -1,12 +1,15 @@
-"""Authors a stage of bodies, shapes and magnets that were made without a stage."""
+"""Authors a stage of bodies, shapes, magnets, joints and coils that were made without a stage."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, Vt
 
+from warpmag.declarations.coils import Coil, FieldMap
 from warpmag.declarations.magnets import Magnet, MagneticSettings
+from warpmag.usd.read.coils import author_coil, author_field_map
 from warpmag.usd.schemas import author_magnet, author_settings
+from warpmag.usd.write.model_joints import StageJoint, author_joint
 
 _COLORS = {"inducible": (0.55, 0.57, 0.6), "permanent": (0.75, 0.08, 0.06), "": (0.32, 0.33, 0.35)}
 """Color by the kind of magnet, linear RGB."""
@@ -88,6 +91,18 @@ class ModelStage:
         if shape.magnet:
             author_magnet(prim, shape.magnet)
         self.shapes.append(path)
+
+    def add_joint(self, joint: StageJoint) -> None:
+        """Add a joint between bodies that were added."""
+        author_joint(self.stage, self._new_path("/World", joint.label), joint, self.bodies)
+
+    def add_source(self, source: Coil | FieldMap, label: str, body: int, pose: np.ndarray) -> None:
+        """Add a coil or a field map with a pose in the frame of a body that was added, or in the world, -1."""
+        path = self._new_path(self.bodies[body] if body >= 0 else "/World", label)
+        xform = UsdGeom.Xform.Define(self.stage, path)
+        _place(xform, pose)
+        author = author_coil if isinstance(source, Coil) else author_field_map
+        author(xform.GetPrim(), source)
 
     def _new_path(self, parent: str, label: str) -> str:
         """Return a path below ``parent`` that no prim has, named after the last part of a label."""
