@@ -113,13 +113,46 @@ def test_what_has_no_gradient_raises():
         magnetics.apply(model.state())
     with wp.Tape(), pytest.raises(warpmag.InputError, match=r"only Magnetics.apply records one"):
         magnetics.induce(model.state())
+    for distance, kinds, reason in (
+        (0.03, ("inducible", "inducible"), "the force between bodies of cells"),
+        (0.021, ("inducible", "permanent"), "the near field of a permanent body"),
+        (0.021, ("permanent", "permanent"), "the near field of a permanent body"),
+    ):
+        model = model_of_boxes(distance, kinds)
+        with wp.Tape(), pytest.raises(warpmag.InputError, match=reason):
+            warpmag.Magnetics(model).apply(model.state())
+
+
+def model_of_boxes(distance, kinds):
+    """Boxes of iron and permanent boxes, some of them a distance [m] apart."""
     builder = new_builder()
-    body = builder.add_body()
-    builder.add_shape_box(body, hx=0.01, hy=0.01, hz=0.01)
-    warpmag.add_inducible(builder, body=body)
-    model = builder.finalize(device="cpu", requires_grad=True)
-    with wp.Tape(), pytest.raises(warpmag.InputError, match="a body of cells has none"):
-        warpmag.Magnetics(model).apply(model.state())
+    for number, kind in enumerate(kinds):
+        body = builder.add_body(xform=wp.transform((distance * number, 0.002, 0.001 * number), wp.quat_identity()))
+        builder.add_shape_box(body, hx=0.01, hy=0.006, hz=0.005)
+        if kind == "inducible":
+            warpmag.add_inducible(builder, body=body)
+        else:
+            warpmag.add_permanent(builder, body=body, magnetization=MAGNETIZATION)
+    return builder.finalize(device="cpu", requires_grad=True)
+
+
+def test_boxes():
+    """An iron box and a permanent box so far away that its closed form does not act."""
+    model = model_of_boxes(0.035, ("inducible", "permanent"))
+    magnetics = warpmag.Magnetics(model, external_field=FIELD, rtol=5e-6)
+    poses, rng = model.body_q.numpy(), np.random.default_rng(5)
+    seed, change = rng.normal(size=(2, 6)) * ([1.0] * 3 + [100.0] * 3), rng.normal(size=(2, 7))
+    change[:, 3:] = 10.0 * (change[:, 3:] - np.sum(change[:, 3:] * poses[:, 3:], axis=1, keepdims=True) * poses[:, 3:])
+    gradient = gradient_of(model, magnetics, poses, seed)
+    values = []
+    for sign in (1.0, -1.0):
+        state = model.state()
+        state.body_q.assign(poses + sign * 1e-3 * change)
+        magnetics.apply(state)
+        values.append(np.sum(seed * state.body_f.numpy()))
+    slope = (values[0] - values[1]) / 2e-3
+    # steps of 1 % in float32, quaternions of length 1 to second order
+    assert abs(np.sum(gradient * change) - slope) < 5e-3 * np.linalg.norm(gradient) * np.linalg.norm(change)
 
 
 def test_a_tape_without_gradients_records_nothing():

@@ -58,6 +58,7 @@ def _arrays_type(dtype):
         by_slope: wp.array[dtype]  # derivative of V‖f‖ by the slope k [A·m²]
         # Linear solve, shape [n]:
         moments: wp.array2d[dtype]  # moments S z whose field is evaluated, rows of packed moments
+        vectors: wp.array[vec3]  # the same as vectors
         field: wp.array[vec3]  # their field T S z
         w: wp.array[vec3]
         z: wp.array[vec3]
@@ -118,6 +119,7 @@ def _times_root(arrays: Any, i: int, v: Any):
 @wp.func
 def _set_moment(arrays: Any, i: int, m: Any):
     """Set the moment whose field is evaluated next."""
+    arrays.vectors[i] = m
     for c in range(3):
         arrays.moments[c, i] = m[c]
 
@@ -289,6 +291,7 @@ class Tangent:
 
     Attributes:
         condition: 1 while any world iterates, shape [1].
+        vectors: The moments that the solve writes, as vectors [A·m²], shape [n].
         rho: Cotangents ρ [1/(A·m²)], written by the caller before :meth:`start`, shape [n].
         eta: ∂L/∂H + S w [m/A], written by :meth:`finish`, shape [n].
     """
@@ -299,13 +302,13 @@ class Tangent:
         self._device, self._dtype, n, worlds = moments.device, moments.dtype, moments.count, state.worlds.shape[0]
         self._arrays = a = _arrays_type(self._dtype)()
         a.moments, a.field, a.rtol = moments.moments, field, rtol
-        for name in ("direction", "w", "z", "image", "p", "q", "r"):
+        for name in ("direction", "vectors", "w", "z", "image", "p", "q", "r"):
             setattr(a, name, wp.zeros_like(field))
         for name in ("parallel", "perpendicular", "by_saturation", "by_slope"):
             setattr(a, name, wp.zeros(n, dtype=self._dtype, device=self._device))
         a.worlds = wp.zeros(worlds, dtype=TangentWorld, device=self._device)
         self.condition = a.condition = wp.zeros(1, dtype=wp.int32, device=self._device)
-        self.rho, self.eta = wp.zeros_like(field), wp.zeros_like(field)
+        self.rho, self.eta, self.vectors = wp.zeros_like(field), wp.zeros_like(field), a.vectors
 
     def linearize(self, h) -> None:
         """Launch the derivatives of the curves in the field ``h`` [A/m], the same array at each call, shape [n]."""

@@ -81,11 +81,38 @@ def add_pose_gradients(magnets: BodyMoments, model, body_q, by_positions, by_mom
 
     The arguments are the gradients by positions, by permanent moments and by lever arms of n moments, shape [n] each.
     """
-    device = body_q.device
-    products = wp.zeros(len(by_positions), dtype=float, device=device, requires_grad=True)
     inputs = [magnets, body_q, model.body_com, by_positions, by_moments, by_arms]
+    _differentiate(_multiply_poses, len(by_positions), inputs, body_q.device)
+
+
+@wp.kernel(module="unique", enable_backward=True)
+def _multiply_rotations(
+    bodies: wp.array[wp.int32],
+    body_q: wp.array[wp.transform],
+    rotations: wp.array[wp.quat],
+    by_rotations: wp.array[wp.vec3],
+    products_out: wp.array[float],
+):
+    k = wp.tid()
+    product = float(0.0)
+    if bodies[k] >= 0:
+        for c in range(3):
+            unit = wp.vec3(float(c == 0), float(c == 1), float(c == 2))
+            axis = wp.transform_vector(body_q[bodies[k]], unit)
+            product = product + 0.5 * wp.dot(axis, wp.cross(by_rotations[k], wp.quat_rotate(rotations[k], unit)))
+    products_out[k] = product
+
+
+def add_rotation_gradients(bodies, body_q, rotations, by_rotations) -> None:
+    """Add to the gradients of ``body_q`` those by small turns of ``bodies`` at their ``rotations``, shape [k] each."""
+    _differentiate(_multiply_rotations, len(bodies), [bodies, body_q, rotations, by_rotations], body_q.device)
+
+
+def _differentiate(kernel, count: int, inputs, device) -> None:
+    """Add to the gradients of inputs those of the sum of a kernel's ``count`` products."""
+    products = wp.zeros(count, dtype=float, device=device, requires_grad=True)
     with wp.Tape() as tape:
-        wp.launch(_multiply_poses, len(products), inputs=inputs, outputs=[products], device=device)
+        wp.launch(kernel, count, inputs=inputs, outputs=[products], device=device)
     products.grad.fill_(1.0)
     tape.backward()
 
@@ -158,10 +185,5 @@ def add_coil_gradients(sources: SourceShapes, model, body_q, frames, by_sources)
 
     ``frames`` are those of the coils in the world, ``by_sources`` as in ``applied.coil_gradients``.
     """
-    device = body_q.device
-    products = wp.zeros(len(frames), dtype=float, device=device, requires_grad=True)
     inputs = [sources, body_q, model.body_com, frames, by_sources]
-    with wp.Tape() as tape:
-        wp.launch(_multiply_frames, len(products), inputs=inputs, outputs=[products], device=device)
-    products.grad.fill_(1.0)
-    tape.backward()
+    _differentiate(_multiply_frames, len(frames), inputs, body_q.device)

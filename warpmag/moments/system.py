@@ -216,6 +216,7 @@ class MomentSystem:
         ``responses`` is True if small bodies respond collectively.
         """
         self._cells = self._cell_pairs = self.rotations = self.crowded = None
+        self._couplings = couplings
         if couplings:
             collective = [responses and len(coupling.radii) <= MOST_CELLS for _, coupling in couplings]
             takes_part = [first not in closed_forms for first, _ in couplings]
@@ -328,7 +329,7 @@ class MomentSystem:
     def gradients(self) -> SystemGradients:
         """Gradients of solves and forces. Their buffers are allocated at the first access."""
         arrays = self._packed, self._induction, self.material, self.worlds, self.world_ranges
-        return SystemGradients(*arrays, self.rtol, self.fmm_rtol, self.sources)
+        return SystemGradients(*arrays, self.rtol, self.fmm_rtol, self.sources, self._couplings)
 
     def start_cold(self, chosen: wp.array | None = None):
         """Start the next solve as the first one, from zero magnetization, in chosen worlds.

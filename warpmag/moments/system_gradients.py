@@ -30,6 +30,7 @@ import warp as wp
 from warpmag.errors import ConvergenceWarning, InputError, warn_caller
 from warpmag.kernels.applied.coil_gradients import CoilGradients
 from warpmag.kernels.applied.sources import FieldSources
+from warpmag.kernels.induction.cell_turns import CellTurns
 from warpmag.kernels.induction.tangent import Tangent
 from warpmag.kernels.material.curves import CurveParameters
 from warpmag.kernels.pairs.evaluate import PairEvaluation
@@ -57,8 +58,11 @@ class SystemGradients:
         rtol: Relative error of the solves, and of the linear solve.
         fmm_rtol: Relative error of fields by the fast multipole method; None means sums over all pairs.
         sources: Coils and field maps; None without them.
+        couplings: First moment and coupling of each body of cells, of which a world has one at most.
 
     Attributes:
+        cells: Gradients by rotations of bodies of cells; None without them. The caller writes their state after
+            :meth:`load`.
         coils: Gradients by coils and field maps; None without them. The caller writes their state after :meth:`load`.
         positions: State: positions [m], shape [n].
         moments: State: moments [A·m²], shape [n].
@@ -79,6 +83,7 @@ class SystemGradients:
         rtol: float,
         fmm_rtol: float | None,
         sources: FieldSources | None = None,
+        couplings=(),
     ):
         """Allocate the buffers."""
         self._moments = PackedMoments(packed.radii, largest_radius=packed.largest_radius, groups=worlds, moving=False)
@@ -98,6 +103,7 @@ class SystemGradients:
             ranks=current_ranks(),
         )  # fmt: skip
         self._tangent = Tangent(state, self._acting, self._field, material, rtol)
+        self.cells = CellTurns(couplings, self._tangent.vectors, self._field) if couplings else None
         self._wrenches = PairGradients(self._bodies, ends, external_field=self.external_field)
         self._fields = (
             _MultipoleGradients(self._moments, self._acting, self._fast, ranges)
@@ -130,6 +136,8 @@ class SystemGradients:
     def evaluate(self) -> None:
         """Launch one field evaluation of the linear solve."""
         self._evaluation.launch()
+        if self.cells is not None:
+            self.cells.add_field()
 
     def wrench(self, force_cotangents, torque_cotangents) -> PairGradients:
         """Return the gradients of a function of forces and torques, from its gradients by them, shape [n] each.
@@ -156,6 +164,7 @@ class SystemGradients:
         if by_field is not None:
             wp.copy(self._given_field, by_field)
             self._acting.pack(self.positions, self._given_field)
+            wp.copy(tangent.vectors, self._given_field)
             self.evaluate()
             launch_add_scaled(self._field, tangent.rho)
         if self._is_inducible:
@@ -164,6 +173,8 @@ class SystemGradients:
             wp.capture_while(tangent.condition, self._iterate)
         tangent.finish(None if by_field is None else self._given_field)
         self._fields.launch()
+        if self.cells is not None:
+            self.cells.turn(self.moments, self.by_field, self.by_moments)
         if self.coils is not None:
             self.coils.launch_field(self.by_field, self.by_positions, self.by_moments)
 

@@ -138,7 +138,7 @@ class Magnetics:
         self._sources.bind(self.system)
         self.coils = self._sources.circuits
         self._map_bodies()
-        self._gradients = ForceGradients(self.system, self._body_moments, self._sources, model)
+        self._gradients = ForceGradients(self.system, self._body_moments, self._sources, model, self._coupled_bodies)
         self._prepare_reset()
         set_conductivities(model, self.magnets, self.system, float(dt))
         if imported is not None:

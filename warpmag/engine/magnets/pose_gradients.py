@@ -9,6 +9,7 @@ from warpmag.kernels.rigid.bodies import BodyMoments
 from warpmag.kernels.rigid.pose_gradients import (
     add_coil_gradients,
     add_pose_gradients,
+    add_rotation_gradients,
     spread_cotangents,
     spread_to_coils,
 )
@@ -24,8 +25,8 @@ def _check_gradients(name: str, system: MomentSystem, sources: ModelSources) -> 
         f"the force {settings.force!r}": settings.force != "kelvin",
         f"the dynamics {settings.dynamics!r}": settings.dynamics != "theta",
         f"the contact model {settings.contact_model!r}": settings.contact_model != "dipole",
-        "a body of cells": system.rotations is not None,
-        "the near field of a permanent body": system.sources is not None and bool(system.sources.solids),
+        "the force between bodies of cells": system.crowded is not None,
+        "the near field of a permanent body": system.source_interaction is not None and _closed_forms_act(system),
         "a coil with a resistance, whose current follows from voltages,": sources.circuits is not None,
         "recoil permeability": system.bias is not None,
         "eddy currents": system.eddy is not None,
@@ -35,12 +36,30 @@ def _check_gradients(name: str, system: MomentSystem, sources: ModelSources) -> 
             raise InputError(f"{name}: requires a gradient, but {reason} has none")
 
 
+def _closed_forms_act(system: MomentSystem) -> bool:
+    """Return False if no permanent body with a closed form is near any other magnet. Waits for the device.
+
+    Then the pairs of moments are the whole force. With coils, or in a captured graph, nobody can tell.
+    """
+    interaction, sources = system.source_interaction, system.sources
+    if not sources.solids:
+        return False
+    if sources.applied or system.device.is_capturing:
+        return True
+    corrected = interaction.field.numpy() != system.external_field.numpy()
+    return bool(corrected.any() or interaction.wrenches.numpy().any())
+
+
 class ForceGradients:
     """Gradients of the forces that :meth:`Magnetics.apply` adds to ``state.body_f``."""
 
-    def __init__(self, system: MomentSystem, magnets: BodyMoments, sources: ModelSources, model):
-        """Prepare the gradients of a system with the moments ``magnets`` and the coils ``sources`` of a model."""
+    def __init__(self, system: MomentSystem, magnets: BodyMoments, sources: ModelSources, model, coupled):
+        """Prepare the gradients of a system with the moments ``magnets`` and the coils ``sources`` of a model.
+
+        ``coupled`` are the bodies of cells, in the order of ``system.rotations``.
+        """
         self._system, self._magnets, self._sources, self._model = system, magnets, sources, model
+        self._coupled = coupled
 
     def arguments(self, state) -> dict[str, wp.array]:
         """Return the arrays that require a gradient, by name."""
@@ -85,6 +104,9 @@ class ForceGradients:
         launch_add_scaled(sums.by_positions, gradients.by_positions)
         launch_add_scaled(sums.by_moments, gradients.by_moments)
         add_pose_gradients(self._magnets, model, body_q, gradients.by_positions, gradients.by_moments, arms)
+        cells = gradients.cells
+        if cells is not None:
+            add_rotation_gradients(self._coupled, body_q, cells.rotations, cells.by_rotations)
         if coils is not None:
             add_coil_gradients(self._sources.on_device, model, body_q, coils.frames, coils.by_sources)
         by_external_field = self._system.external_field.grad
@@ -103,11 +125,14 @@ class _SolvedMoments:
         self._external_field = wp.clone(system.external_field, requires_grad=False)
         coils = system.sources
         self._coils = None if coils is None else (wp.clone(coils.frames), wp.clone(coils.strengths))
+        self._rotations = None if system.rotations is None else wp.clone(system.rotations)
 
     def load(self) -> None:
         """Compute gradients at this state."""
         gradients = self._system.gradients
         gradients.load(self.positions, self._moments, self._h, self._external_field)
+        if self._rotations is not None:
+            wp.copy(gradients.cells.rotations, self._rotations)
         if self._coils is not None and gradients.coils is not None:
             wp.copy(gradients.coils.frames, self._coils[0])
             wp.copy(gradients.coils.strengths, self._coils[1])
