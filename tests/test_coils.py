@@ -174,6 +174,48 @@ def test_fixed_bodies_and_fixed_maps(device):
         np.testing.assert_allclose(field, expected, atol=SINGLE * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("coil_moves", [False, True])
+def test_fields_at_magnets_that_nothing_moves_are_left_out(device, coil_moves):
+    """Static coil and static magnet: no field is evaluated there, the energy and the forces on others are the same."""
+    energies, wrenches = [], []
+    for kinematic in (False, True):
+        builder = new_builder()
+        magnet = builder.add_body(xform=wp.transform((0.0, 0.0, 0.01), wp.quat_identity()), is_kinematic=kinematic)
+        builder.add_shape_box(magnet, hx=0.003, hy=0.003, hz=0.003)
+        warpmag.add_permanent(builder, body=magnet, magnetization=(0.0, 2e5, 1e6))
+        holder = builder.add_body(is_kinematic=not coil_moves)
+        warpmag.add_coil(builder, body=holder, radius=A, ampere_turns=50.0)
+        add_ball(builder, (0.02, 0.0, 0.02))
+        model = builder.finalize(device=device)
+        magnetics, state = warpmag.Magnetics(model), model.state()
+        magnetics.apply(state)
+        chunks = magnetics.system.source_interaction.arrays.targets.chunk.numpy()
+        assert chunks[:, 1].sum() == (1 if kinematic else magnetics.system.count)
+        energies.append(magnetics.energy())
+        magnetics.apply(state)  # the energy leaves no trace
+        wrenches.append(0.5 * state.body_f.numpy()[1:])
+    np.testing.assert_allclose(energies[1], energies[0], rtol=1e-6)
+    np.testing.assert_allclose(wrenches[1], wrenches[0], atol=SINGLE * np.abs(wrenches[0]).max())
+    assert np.abs(wrenches[1][0]).max() > 0.0 or not coil_moves
+
+
+def test_a_coil_does_not_act_on_the_magnet_that_carries_it(device):
+    """The body gets the wrench of the ball alone."""
+    builder = new_builder()
+    body = builder.add_body()
+    builder.add_shape_box(body, hx=0.003, hy=0.003, hz=0.003)
+    warpmag.add_permanent(builder, body=body, magnetization=(0.0, 0.0, 1e6))
+    warpmag.add_coil(builder, body=body, radius=A, xform=((0.0, 0.0, 0.004), wp.quat_identity()), ampere_turns=50.0)
+    add_ball(builder, (0.0, 0.0, 0.03))
+    model = builder.finalize(device=device)
+    magnetics, state = warpmag.Magnetics(model), model.state()
+    magnetics.apply(state)
+    force = state.body_f.numpy()
+    assert force[1, 2] < 0.0
+    np.testing.assert_allclose(force[0, :3], -force[1, :3], atol=1e-5 * abs(force[1, 2]))
+    assert not magnetics.system.source_interaction.acting.numpy()[1:].any()
+
+
 def test_records_survive_as_text():
     for record in (
         Coil(radius=0.1).record(),

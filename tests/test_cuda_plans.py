@@ -260,7 +260,7 @@ LINES = AppliedSource(SourceKind.POLYLINE, (1e-4,), 0.05 * np.eye(3))
 
 def solid(first: int, **settings) -> SolidMagnet:
     """A box with one moment."""
-    return SolidMagnet(first, 1, 8e-6, 0, 0.1, polyhedra.box(BOX), True, **settings)
+    return SolidMagnet(first, 1, 8e-6, 0, 0.1, polyhedra.box(BOX), polyhedra.box_moments(BOX), True, **settings)
 
 
 def cells(spacing: float) -> dict:

@@ -39,7 +39,7 @@ def box(half, device, **settings):
     """What a ball and a box of 1e4 A/m along z feel of each other: forces, and the box's torque, shape [9], float64."""
     body = polyhedra.box_moments(half)
     n = len(body.volumes)
-    solid = SolidMagnet(1, n, body.volumes[0], 0, body.reach, polyhedra.box(half), True)
+    solid = SolidMagnet(1, n, body.volumes[0], 0, body.reach, polyhedra.box(half), body, True)
     system = moment_system(
         radii=np.append(R, body.depths), permanent=np.arange(n + 1) > 0, bodies=np.append(0, np.ones(n, int)),
         saturation=LINEAR, solids=[solid], dtype="float64", rtol=1e-10, device=device, **settings,

@@ -3,13 +3,14 @@
 May import ``shared``, ``material`` and ``pairs``. The field of such a source does not depend on other sources. It
 follows from a closed form, or from a table, in the frame of the source.
 
-Coils and maps act at any distance, in proportion to a strength. A permanent body acts as a lattice of moments. Targets
-within its reach, a few lattice cells, get a correction: the closed form of the body's field less that of its lattice.
-Two bodies near each other get the force and torque between their surface charges, less the force and torque between
-their moments.
+Coils and maps act at any distance, in proportion to a strength. A permanent body acts by few moments of the system.
+Targets nearer than its far reach get a correction: the field of more moments less that of the few. Within its reach the
+closed form of its field takes their place. Two bodies near each other likewise get the force and torque between more
+moments, or between their surface charges.
 
-Fields are evaluated once per solve at all moments, and added to the external field. The reaction on a source is summed
-from the same fields, so that forces are opposite and equal. Without sources none of these kernels is launched.
+Fields are evaluated once per solve, and added to the external field. Permanent moments that no force moves are left
+out. The reaction on a source is summed from the same fields, so that forces are opposite and equal. Without sources
+none of these kernels is launched.
 
 | module | content |
 |---|---|

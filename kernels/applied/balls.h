@@ -65,7 +65,7 @@ template <class Arrays> CUDA_CALLABLE inline void add_coil(const Arrays& arrays,
         add_faded(ball.fields[v], fade, field);
     }
 }
-// Adds the field of a permanent body: the closed form within the body's reach, else the field of its lattice. Far away
+// Adds the field of a permanent body: the closed form within the body's reach, else the field of its moments. Far away
 // the closed form would lose digits by cancellation.
 template <class Arrays>
 CUDA_CALLABLE inline void add_body(const Arrays& arrays, const PermanentBody& body, Ball& ball) {
@@ -77,10 +77,10 @@ CUDA_CALLABLE inline void add_body(const Arrays& arrays, const PermanentBody& bo
     const Number zero = Number(Real(0)), least2 = zero + Real(0.0625) * ball.radius * ball.radius;
     for (int v = 0; v < VECTORS_PER_THREAD && Ball::first(v) < CHUNK; ++v) {
         const Vector x = ball.points(arrays, v);
+        const Vector at = body.frame.point_to_body(x);
         const CurlFreeField field =
-            near ? body.frame.to_world(field_of(body.solid, body.m, body.frame.point_to_body(x), least2, 0, 1))
-                 : (INVERSE_4PI * lattice_field(arrays, body, x, zero, x.x != x.x, 0, 1));
-        add_faded(ball.fields[v], fade, target_field(field));
+            near ? field_of(body.solid, body.m, at, least2, 0, 1) : moments_field(arrays, body, at, 0, 1);
+        add_faded(ball.fields[v], fade, target_field(body.frame.to_world(field)));
     }
 }
 

@@ -53,6 +53,8 @@ class AppliedField:
     Args:
         targets: The targets, packed (``packing.PackedMoments``); read at each launch, as is ``base``.
         worlds: World of each target, shape [t].
+        magnetized, movable: True for targets that fields magnetize, and for targets whose force is computed, shape [t].
+            The fields at others serve energies only (:meth:`launch_left_out`).
         base: Field that is added to [A/m], Warp array, shape [t].
         points: True if targets are points of a probe, false if they are all moments.
 
@@ -69,13 +71,14 @@ class AppliedField:
     rates: wp.array | None = None
     """Rate of the field of other bodies' sources [A/(m·s)], shape [t]; None before :meth:`enable_rates`."""
 
-    def __init__(self, sources: FieldSources, targets, worlds, base, *, points: bool):
+    def __init__(self, sources: FieldSources, targets, worlds, base, *, points: bool, magnetized=True, movable=True):
         """Allocate the results."""
         self.sources, self.device, self.count, self._points = sources, sources.device, targets.count, points
         self.arrays = arrays = source_arrays_type(sources.dtype)()
         arrays.coils, arrays.solids, arrays.packed = sources.coil_arrays, sources.solid_arrays, sources.packed.packed
         arrays.targets.packed, arrays.targets.base = targets.packed, base
-        self._lay_out_targets(np.asarray(worlds))
+        magnetized, movable = (np.broadcast_to(rows, self.count) for rows in (magnetized, movable))
+        self._lay_out_targets(np.asarray(worlds), magnetized, magnetized | movable)
         vec3 = wp.types.vector(3, sources.dtype)
         names = ("field", "acting", "along_x", "along_y", "along_z", *(["inside"] if points else []))
         results = [wp.zeros(self.count, dtype=vec3, device=sources.device) for _ in names]
@@ -87,19 +90,26 @@ class AppliedField:
     def _integers(self, values, kind=wp.int32) -> wp.array:
         return wp.array(np.ascontiguousarray(values, np.int32), dtype=kind, device=self.device)
 
-    def _lay_out_targets(self, worlds):
-        """List the chunks of targets, each in one world, and mark the targets that closed forms correct."""
-        sources, targets, corrected = self.sources, self.arrays.targets, np.ones(self.count)
+    def _lay_out_targets(self, worlds, magnetized, needed):
+        """Mark the kinds of the targets, and list the chunks of those that are ``needed`` and of the others."""
+        sources, targets, corrected = self.sources, self.arrays.targets, np.ones(self.count, int)
         for solid in () if self._points else sources.solids:
             corrected[solid.first : solid.first + solid.count] = 0
-        targets.corrected = self._integers(corrected)
+        targets.kind = self._integers(corrected + 2 * magnetized)
+        targets.chunk, targets.lists = self._chunks(worlds, needed)
+        self._left_out = self._chunks(worlds, ~needed)
+
+    def _chunks(self, worlds, chosen) -> tuple[wp.array, wp.array]:
+        """Return the chunks of chosen targets, each in one world, and their ranges of coils and maps."""
+        sources, worlds = self.sources, np.where(chosen, worlds, -1)
         edges, starts = np.flatnonzero(np.diff(worlds, prepend=-1, append=-1)), []
         for begin, end in itertools.pairwise(edges):
-            starts += [(k, min(CHUNK, end - k)) for k in range(begin, end, CHUNK)]
+            if worlds[begin] >= 0:
+                starts += [(k, min(CHUNK, end - k)) for k in range(begin, end, CHUNK)]
         starts = np.array(starts, int).reshape(-1, 2)
         world = worlds[starts[:, 0]].astype(int)
-        targets.chunk = self._integers(np.concatenate([starts, sources.bodies_of(world)], axis=1), wp.vec4i)
-        targets.lists = self._integers(np.stack([sources.lists[world], sources.lists[world + 1]], axis=1), wp.vec2i)
+        chunks = self._integers(np.concatenate([starts, sources.bodies_of(world)], axis=1), wp.vec4i)
+        return chunks, self._integers(np.stack([sources.lists[world], sources.lists[world + 1]], axis=1), wp.vec2i)
 
     def run_passes(self, first: int, last: int, items: int, group: int, share: int):
         """Launch passes: on a GPU with ``group`` threads per item, on a CPU with ``share`` items per thread."""
@@ -117,11 +127,25 @@ class AppliedField:
 
     def launch(self):
         """Launch the evaluation of the field at the targets, from the present positions of sources and targets."""
+        self._launch_at_targets()
+        self.run_passes(AT_CELLS, AT_CELLS, self.cell_count, _GROUP, _CELLS_PER_THREAD)
+
+    def launch_left_out(self):
+        """Launch the evaluation at the targets that :meth:`launch` leaves out; not to be captured in a graph."""
+        targets = self.arrays.targets
+        needed = targets.chunk, targets.lists
+        for chunks in (self._left_out, needed):
+            targets.chunk, targets.lists = chunks
+            self._commands.pop((AT_TARGETS, AT_TARGETS), None)
+            if chunks is self._left_out:
+                self._launch_at_targets()
+
+    def _launch_at_targets(self):
+        """Launch the evaluation at the chunks of targets."""
         group = group_threads(self.device) if self.sources.solids else 1
         share = _TARGETS_PER_THREAD // max(1, int(np.diff(self.sources.lists).max(initial=0)))
         evaluation = AT_POINTS if self._points else AT_TARGETS
         self.run_passes(evaluation, evaluation, CHUNK * self.arrays.targets.chunk.shape[0], group, max(share, 1))
-        self.run_passes(AT_CELLS, AT_CELLS, self.cell_count, _GROUP, _CELLS_PER_THREAD)
 
     def add_to_probe(self, b, gradients):
         """Add μ0 M to the flux density [T] at points inside bodies, and the sources' gradients [A/m²] unless None."""
@@ -185,8 +209,7 @@ class AppliedForces(AppliedField):
     """Forces and torques of sources on moments, and the reactions on sources.
 
     Args:
-        sources, worlds, base: As of :class:`AppliedField`, whose targets are all moments.
-        movable: True for moments whose force is computed, shape [n].
+        sources, worlds, base, magnetized, movable: As of :class:`AppliedField`, whose targets are all moments.
         balls: True for balls whose multipoles respond to the field, shape [n]; None without such balls.
         constants: First and last distance from a source [radii] over which the multipoles fade, and the number of rows
             of ``response``.
@@ -199,9 +222,9 @@ class AppliedForces(AppliedField):
             their moments.
     """
 
-    def __init__(self, sources: FieldSources, worlds, base, movable, *, balls=None, constants=()):
+    def __init__(self, sources: FieldSources, worlds, base, magnetized, movable, *, balls=None, constants=()):
         """Allocate the results."""
-        super().__init__(sources, sources.packed, worlds, base, points=False)
+        super().__init__(sources, sources.packed, worlds, base, points=False, magnetized=magnetized, movable=movable)
         self.expansion, ball_indices = None, np.zeros(0, int)
         if balls is not None and np.any(balls):
             self.balls, ball_indices = (1, *constants), np.flatnonzero(balls)

@@ -1,7 +1,7 @@
 // Passes over targets and sources: fields at targets, over cells and about balls, and the reactions on sources.
 //
-// Fields and forces of a permanent body are corrections, its closed form less its lattice: the sums over pairs contain
-// the lattice already. On a CPU a pass works on a vector of targets or points. On a GPU a group of threads shares a
+// Fields and forces of a permanent body are corrections, less those of its moments in the system, which the sums over
+// pairs contain already. On a CPU a pass works on a vector of targets or points. On a GPU a group of threads shares a
 // target, a ball, a row of targets, or a body.
 //
 // Takes GROUP, MU0 and INVERSE_4PI from Python, and the switches COILS, SOLIDS, CELLS, BALLS and RATES. On a GPU a
@@ -19,11 +19,12 @@ enum SourcePass { AT_TARGETS, AT_POINTS, AT_CELLS, AT_BALLS, ON_CELLS, REACT, AD
 enum RowKind { OF_TARGETS, OF_BALLS, OF_CELLS };                                        // as in fields.py
 constexpr int WRENCH_ROW = 7;                                                           // force, torque, energy
 
-// Targets from column i on: positions, radii, labels, and whether closed forms correct their fields.
+// Targets from column i on: positions, radii, labels, and bits of their kind.
+constexpr int CORRECTED = 1, MAGNETIZED = 2; // bits of a target, as in sources.py
 struct Targets {
     Vector x;
     Number radius, label;
-    Index corrected;
+    Index kind;
 };
 template <class Arrays> CUDA_CALLABLE inline Targets targets_at(const Arrays& arrays, int i, int lane_count) {
     const Number zero = Number(Real(0));
@@ -35,9 +36,9 @@ template <class Arrays> CUDA_CALLABLE inline Targets targets_at(const Arrays& ar
     auto row = [=](int n) -> Number { return numbers(rows + n * pitch); };
     at = {{row(0), row(1), row(2)}, row(3), row(7), {}};
 #if defined(__CUDA_ARCH__)
-    at.corrected = arrays.targets.corrected.data[i];
+    at.kind = arrays.targets.kind.data[i];
 #else
-    for (int l = 0; l < lane_count && l < WIDTH; ++l) at.corrected[l] = arrays.targets.corrected.data[i + l];
+    for (int l = 0; l < lane_count && l < WIDTH; ++l) at.kind[l] = arrays.targets.kind.data[i + l];
 #endif
     return at;
 }
@@ -52,10 +53,12 @@ CUDA_CALLABLE inline Vector add_coil_fields(const Arrays& arrays, const int* lis
         Point sum = {0, 0, 0};
         PointField others = {};
         for (int k = begin; k < count; k += step) {
+            const bool acts = arrays.coils.label.data[list[k]] != lane_of(at.label, l);
+            if (!acts && !(lane_of(at.kind, l) & MAGNETIZED)) continue;
             const PointField f =
                 field_at(arrays, list[k], {lane_of(at.x.x, l), lane_of(at.x.y, l), lane_of(at.x.z, l)});
             sum += f.h;
-            if (arrays.coils.label.data[list[k]] != lane_of(at.label, l)) others = others + f;
+            if (acts) others = others + f;
         }
         set_lane(h, l, sum), set_lane(acting.h, l, others.h);
         set_lane(acting.x, l, others.dx), set_lane(acting.y, l, others.dy), set_lane(acting.z, l, others.dz);
@@ -63,9 +66,10 @@ CUDA_CALLABLE inline Vector add_coil_fields(const Arrays& arrays, const int* lis
     return h;
 }
 
-// Mask of targets whose field a body's closed form corrects.
+// Mask of targets at which a body's field is corrected.
 template <class Arrays> CUDA_CALLABLE inline Mask within_reach(const PermanentBody& body, const Targets& at) {
-    return mask_of(at.corrected != 0) & (box_distance2(body, body.frame.point_to_body(at.x)) < body.reach * body.reach);
+    return mask_of((at.kind & CORRECTED) != 0)
+           & (box_distance2(body, body.frame.point_to_body(at.x)) < body.far_reach * body.far_reach);
 }
 
 // Writes the fields at a vector of targets. POINTS is true for points of a probe, false for moments.
@@ -186,11 +190,15 @@ CUDA_CALLABLE inline void add_body_pairs(const Arrays& arrays, int b, Real (&tot
         const PermanentBody &q = is_smaller ? body : other, &s = is_smaller ? other : body;
         const Real3 &p = q.frame.origin, &x = q.frame.x, &y = q.frame.y, &z = q.frame.z, &d = q.box_center;
         const Vector center = broadcast(p + d.x * x + (d.y * y + d.z * z));
-        const Real reach = q.radius + (q.reach > s.reach ? q.reach : s.reach);
-        if (!any(box_distance2(s, s.frame.point_to_body(center)) < Number(Real(0)) + reach * reach)) continue;
+        const Number distance2 = box_distance2(s, s.frame.point_to_body(center));
+        auto is_within = [&](Real a, Real b) {
+            const Real reach = q.radius + (a > b ? a : b);
+            return any(distance2 < Number(Real(0)) + reach * reach);
+        };
+        if (!is_within(q.far_reach, s.far_reach)) continue;
         Real3 force, torque;
         Real energy;
-        body_wrench(arrays, q, s, force, torque, energy);
+        body_wrench(arrays, q, s, is_within(q.reach, s.reach), force, torque, energy);
         if (is_smaller) add_force_torque(total, force, torque, MU0);
         else {
             const Real3 arm_torque = cross(reference_point(arrays, q) - reference_point(arrays, s), force);

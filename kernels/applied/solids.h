@@ -1,4 +1,5 @@
-// Permanent bodies: their frames, the fields of their lattices, and the closed form's correction to these fields.
+// Permanent bodies: their frames, the fields of their moments in the system, and the correction of these fields by the
+// closed form nearby, and by more moments up to a larger distance.
 //
 // ``Arrays`` is the struct of sources.py. Takes INVERSE_4PI from Python.
 #pragma once
@@ -7,7 +8,8 @@
 
 namespace warpmag {
 
-constexpr int SHAPE_ROW = 10, SIZE_ROW = 9; // numbers of a shape and of a body; as in solids.py
+// Numbers of a shape and of a body, as in solids.py; numbers of a moment: position and volume.
+constexpr int SHAPE_ROW = 12, SIZE_ROW = 10, MOMENT_ROW = 4;
 
 // Origin and axes of a body in the world.
 struct Frame {
@@ -65,8 +67,8 @@ struct PermanentBody {
     Solid solid;
     Frame frame;
     Real3 m, box_center, box_half, m_world;
-    Real reach, radius, label; // ``radius`` of its bounding sphere
-    int first, count, shape, responds;
+    Real reach, far_reach, radius, label; // ``radius`` of its bounding sphere
+    int first, count, shape, responds;    // ``first`` and ``count`` of its moments in the system
 };
 // One number of a packed moment. Rows are position (0 to 2), radius (3), moment (4 to 6) and label (7).
 template <class Arrays> CUDA_CALLABLE inline Real packed_at(const Arrays& arrays, int row, int i) {
@@ -79,7 +81,7 @@ template <class Arrays> CUDA_CALLABLE inline PermanentBody body_at(const Arrays&
     const int* const row =
         arrays.solids.body.data + 4 * (size_t)b; // shape, first moment, number of moments, 1 if it responds
     const int* const tables = arrays.solids.shape.data + SHAPE_ROW * (size_t)row[0];
-    // 1/V of the first moment, or k if the body responds; reach, radius, box_center, box_half
+    // 1/V of the first moment, or k if the body responds; reach, far_reach, radius, box_center, box_half
     const Real* const size = arrays.solids.size.data + SIZE_ROW * (size_t)b;
     const Solid solid = {arrays.solids.edge.data + EDGE_ROW * (size_t)tables[0],
                          arrays.solids.face.data + FACE_ROW * (size_t)tables[2],
@@ -92,11 +94,9 @@ template <class Arrays> CUDA_CALLABLE inline PermanentBody body_at(const Arrays&
     const Real3 magnetized =
         row[3] ? real3((const Real*)arrays.solids.bias.data + 3 * (size_t)first) : packed_real3(arrays, 4, first);
     const Real3 m = size[0] * magnetized;
-    return {solid,           frame,           frame.to_body(m),
-            real3(size + 3), real3(size + 6), m,
-            size[1],         size[2],         packed_at(arrays, 7, first),
-            first,           row[2],          row[0],
-            row[3]};
+    return {solid, frame,   frame.to_body(m), real3(size + 4), real3(size + 7),
+            m,     size[1], size[2],          size[3],         packed_at(arrays, 7, first),
+            first, row[2],  row[0],           row[3]};
 }
 
 // Moment j of a body's lattice that the closed form replaces: only the part by the remanence if the body responds to
@@ -125,7 +125,17 @@ CUDA_CALLABLE inline Number box_distance2(const PermanentBody& body, Vector at) 
     return dot(d, d);
 }
 
-// 4π times field and gradient of a body's lattice at balls of the given radius, as in the sums over pairs.
+// Adds 4π times field and gradient of a moment m at the distance r of inverse length i.
+CUDA_CALLABLE inline void add_dipole(CurlFreeField& out, Vector r, Number i, Vector m) {
+    const Number i2 = i * i, i3 = i2 * i, g2 = 3 * i2 * i3, rm = dot(r, m);
+    const Number g3 = -5 * i2 * (g2 * rm); // avoids r⁻⁷, which overflows float32 at 1 µm
+    out.h += (g2 * rm * r - i3 * m);
+    add_product(out.t, g2, r, m), add_product(out.t, g2, m, r), add_product(out.t, g3, r, r);
+    out.t.xx += g2 * rm, out.t.yy += g2 * rm, out.t.zz += g2 * rm;
+}
+
+// 4π times field and gradient of a body's moments in the system at balls of the given radius, as in the sums over
+// pairs.
 template <class Arrays>
 CUDA_CALLABLE inline CurlFreeField lattice_field(const Arrays& arrays, const PermanentBody& body, Vector x,
                                                  Number radius, Mask mask, int begin, int step) {
@@ -135,12 +145,7 @@ CUDA_CALLABLE inline CurlFreeField lattice_field(const Arrays& arrays, const Per
         const Vector m = broadcast(moment_at(arrays, body, j));
         const Number source_radius = Number(Real(0)) + packed_at(arrays, 3, j), s = radius + source_radius,
                      d2 = dot(r, r), s2 = s * s;
-        const Number c = larger(d2, s2), i = Real(0.5) * twice_inverse_root(c), i2 = i * i, i3 = i2 * i;
-        const Number g2 = 3 * i2 * i3, rm = dot(r, m);
-        const Number g3 = -5 * i2 * (g2 * rm); // avoids r⁻⁷, which overflows float32 at 1 µm
-        out.h += (g2 * rm * r - i3 * m);
-        add_product(out.t, g2, r, m), add_product(out.t, g2, m, r), add_product(out.t, g3, r, r);
-        out.t.xx += g2 * rm, out.t.yy += g2 * rm, out.t.zz += g2 * rm;
+        add_dipole(out, r, Real(0.5) * twice_inverse_root(larger(d2, s2)), m);
         const Mask overlapping = mask & (d2 < s2);
         if (!any(overlapping)) continue;
         const Overlap p = overlap_of(r, radius, source_radius, m, overlapping);
@@ -154,17 +159,41 @@ CUDA_CALLABLE inline CurlFreeField lattice_field(const Arrays& arrays, const Per
     return out;
 }
 
-// Closed form of a body's field less the field of its lattice, in the world.
+// Field and gradient of the moments that replace a body's closed form, at x in the frame of the body.
+template <class Arrays>
+CUDA_CALLABLE inline CurlFreeField moments_field(const Arrays& arrays, const PermanentBody& body, Vector x, int begin,
+                                                 int step) {
+    const int* const tables = arrays.solids.shape.data + SHAPE_ROW * (size_t)body.shape;
+    const Vector m = broadcast(body.m);
+    CurlFreeField out = zero_field();
+    for (int j = tables[10] + begin; j < tables[10] + tables[11]; j += step) {
+        const Real* const at = rows_at(arrays.solids.moment.data, MOMENT_ROW, j);
+        const Vector r = x - broadcast({at[0], at[CHUNK], at[2 * CHUNK]});
+        add_dipole(out, r, Real(0.5) * twice_inverse_root(dot(r, r)), at[3 * CHUNK] * m);
+    }
+    return INVERSE_4PI * out;
+}
+
+// Field of a body at targets nearer than its far reach, less the field of its moments in the system, in the world.
 template <class Arrays>
 CUDA_CALLABLE inline CurlFreeField field_correction(const Arrays& arrays, const PermanentBody& body, Vector x,
                                                     Number radius, Mask mask, int begin, int step) {
-    const CurlFreeField near =
-        field_of(body.solid, body.m, body.frame.point_to_body(x), Real(0.25) * radius * radius, begin, step);
+    const Vector at = body.frame.point_to_body(x);
+    const Mask near = box_distance2(body, at) < body.reach * body.reach, close = mask & near, apart = mask & !near;
+    CurlFreeField field = zero_field();
+    if (any(close)) {
+        const CurlFreeField exact = field_of(body.solid, body.m, at, Real(0.25) * radius * radius, begin, step);
+        add_where(close, field.h, exact.h), add_where(close, field.t, exact.t);
+    }
+    if (any(apart)) {
+        const CurlFreeField summed = moments_field(arrays, body, at, begin, step);
+        add_where(apart, field.h, summed.h), add_where(apart, field.t, summed.t);
+    }
     const CurlFreeField far = lattice_field(arrays, body, x, radius, mask, begin, step);
-    return body.frame.to_world(near) - INVERSE_4PI * far;
+    return body.frame.to_world(field) - INVERSE_4PI * far;
 }
 
-// Magnetization of the body less that of its lattice's balls, at x.
+// Magnetization of the body less that of its moments' balls, at x.
 template <class Arrays>
 CUDA_CALLABLE inline Vector magnetization_correction(const Arrays& arrays, const PermanentBody& body, Vector x,
                                                      int begin, int step) {

@@ -3,16 +3,18 @@
 Bodies of one shape share its tables:
 
     shape: First row and number of edges and of faces, first entry of ``begin``, first corner, first and number of
-        points on edges and on faces, shape [shapes, 10].
+        points on edges and on faces, first entry and number of the moments, shape [shapes, 12].
     edge, face, corner, begin: As in ``polyhedron.h``; flat.
     edge_point, face_point: Quadrature points on edges and faces (``warpmag.shapes.polyhedra``), in chunks of
         ``native.CHUNK`` side by side. Chunks are filled up with points of weight 0; flat.
+    moment: Positions [m] and volumes [m³] of the moments that replace the closed form at a distance, in the frame of
+        the body, in the same chunks; flat.
 
 Each body has a row in two tables:
 
     body: Shape, first moment, number of moments, and 1 if it responds to fields, shape [bodies, 4].
-    size: 1/V of its first moment [1/m³], or the response k of a body that responds. Then reach, radius of the bounding
-        sphere, center and half sides of the box [m], shape [bodies, 9].
+    size: 1/V of its first moment [1/m³], or the response k of a body that responds. Then both reaches, radius of the
+        bounding sphere, center and half sides of the box [m], shape [bodies, 10].
 """
 
 from dataclasses import dataclass
@@ -31,6 +33,9 @@ class SolidMagnet:
 
     The body is uniformly magnetized, or responds to fields. If it responds, induction solves for its moments, and the
     closed form has the magnetization of a ball by the remanence alone.
+
+    The system has as many moments as the body needs far away. Nearer than ``far_reach`` the body acts as ``moments``,
+    nearer than ``reach`` as the closed form.
     """
 
     first: int  # first moment
@@ -39,20 +44,23 @@ class SolidMagnet:
     world: int  # its world
     reach: float  # distance up to which the closed form is used [m]
     shape: Any  # the ``warpmag.shapes.polyhedra.Polyhedron`` that bounds it, in the frame of its body
+    moments: Any  # the ``polyhedra.Moments`` that replace it at a distance, in that frame
     movable: bool  # true if the force on it is computed
     response: float = 0.0  # k = 3χ/(3 + χ) if it responds to fields, else 0
+    far_reach: float = 0.0  # distance from which on its moments in the system act alone [m], at least ``reach``
 
     def size(self) -> list[float]:
         """Return the body's row of ``size``."""
         lower, upper = self.shape.corners.min(axis=0), self.shape.corners.max(axis=0)
         center = 0.5 * (lower + upper)
         radius = np.linalg.norm(self.shape.corners - center, axis=1).max()
-        return [self.response or 1.0 / self.volume, self.reach, radius, *center, *(0.5 * (upper - lower))]
+        reaches = self.reach, max(self.reach, self.far_reach)
+        return [self.response or 1.0 / self.volume, *reaches, radius, *center, *(0.5 * (upper - lower))]
 
 
 def tables_of(solids, *, fine: bool = False) -> dict[str, np.ndarray]:
     """Return all tables of the bodies ``solids``, with more points on faces if ``fine``."""
-    shapes = {id(solid.shape): solid.shape for solid in solids}
+    shapes = {id(solid.shape): solid for solid in solids}
     number = {key: k for k, key in enumerate(shapes)}
     rows, tables = _shape_tables(shapes.values(), fine)
     tables["shape"] = rows
@@ -71,21 +79,24 @@ def _in_chunks(points) -> np.ndarray:
     return filled.reshape(-1, CHUNK, points.shape[1]).transpose(0, 2, 1)
 
 
-def _shape_tables(shapes, fine: bool):
-    """Return the table ``shape``, and the other tables by name."""
-    rows, parts = [], {name: [] for name in ("edge", "face", "corner", "begin", "edge_point", "face_point")}
-    counts = np.zeros(6, int)  # edges, faces, entries of begin, corners, points on edges, points on faces
-    for shape in shapes:
+def _shape_tables(solids, fine: bool):
+    """Return the table ``shape`` of the shapes of ``solids``, and the other tables by name."""
+    rows, parts = [], {name: [] for name in ("edge", "face", "corner", "begin", "edge_point", "face_point", "moment")}
+    counts = np.zeros(7, int)  # edges, faces, entries of begin, corners, points on edges and on faces, moments
+    for shape, moments in ((solid.shape, solid.moments) for solid in solids):
         edges, faces = shape.edge_rows(), shape.normals
+        replacing = np.c_[moments.positions, moments.volumes]
         begin = np.append(0, np.cumsum([len(face) for face in shape.faces]))
         on_edges, on_faces = _in_chunks(shape.edge_points()), _in_chunks(shape.face_points(fine=fine))
-        points = CHUNK * len(on_edges), CHUNK * len(on_faces)
+        in_body = _in_chunks(replacing)
+        points = CHUNK * len(on_edges), CHUNK * len(on_faces), CHUNK * len(in_body)
         start = counts.tolist()
         rows.append([
             start[0], len(edges), start[1], len(faces), start[2], start[3], start[4], points[0], start[5], points[1],
+            start[6], len(replacing),
         ])  # fmt: skip
         corners = shape.corners[np.concatenate([np.asarray(face) for face in shape.faces])]
-        for name, part in zip(parts, (edges, faces, corners, begin, on_edges, on_faces), strict=True):
+        for name, part in zip(parts, (edges, faces, corners, begin, on_edges, on_faces, in_body), strict=True):
             parts[name].append(np.asarray(part).reshape(-1))
         counts += [len(edges), len(faces), len(begin), len(corners), *points]
     return np.array(rows, np.int32), {name: np.concatenate(part) for name, part in parts.items()}

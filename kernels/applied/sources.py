@@ -91,6 +91,7 @@ def solid_arrays_type(dtype):
         begin: wp.array[int]
         edge_point: wp.array[dtype]
         face_point: wp.array[dtype]
+        moment: wp.array[dtype]
         # Bodies, shape [bodies]:
         body: wp.array2d[int]
         size: wp.array2d[dtype]
@@ -111,7 +112,7 @@ def target_arrays_type(dtype):
     class TargetArrays:
         # Data in, shape [t]:
         packed: wp.array2d[dtype]  # packed targets, shape [8, t]
-        corrected: wp.array[int]  # 0 for moments of permanent bodies, 1 for others
+        kind: wp.array[int]  # bits: 1 for all but moments of permanent bodies, 2 for what fields magnetize, and points
         base: wp.array[vec3]  # field that is added to [A/m]
         # Chunks of targets, each in one world, shape [chunks]:
         chunk: wp.array[wp.vec4i]  # first target, number of targets, range of permanent bodies

@@ -187,7 +187,7 @@ class MomentSystem:
         if sources or solids:
             self.sources = FieldSources(sources, solids, self._packed, len(layout.ranges()), self.bias)
             self.source_interaction = AppliedForces(
-                self.sources, layout.worlds, self.external_field, layout.movable,
+                self.sources, layout.worlds, self.external_field, ~layout.permanent, layout.movable,
                 balls=layout.balls if self.settings.contact_model == "multipole" else None,
                 constants=nonuniform.expansion_constants(),
             )  # fmt: skip
@@ -528,6 +528,8 @@ class MomentSystem:
             self._permanent_fields = evaluation, out
         evaluation, permanent_field = self._permanent_fields
         evaluation.launch()
+        if self.source_interaction is not None:
+            self.source_interaction.launch_left_out()
         energies = wp.zeros(self.count, dtype=wp.float64, device=self.device)
         fields = self._induction.h, self._induction.h0, permanent_field, self._acting_field
         launch_energy(self.radii, self.moments, self.material, *fields, energies)

@@ -11,7 +11,7 @@ needs an integral over its area, ∫ (a − n n·a) dA. Between touching bodies,
 continuous, so that a small interpenetration changes the force only a little.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -27,6 +27,10 @@ _REACH, _REMAINDER, _MOST_MOMENTS = 1.5, 1e-5, 256
 """For the moments that replace a body at a distance: smallest distance, in halves of the body's smallest side; relative
 error of the field there from the Gauss points along one axis; largest number of moments. If more moments were needed,
 the distance is increased."""
+_FAR_REACH, _FAR_REMAINDER = 5.0, 1.2e-4
+"""For the few moments that replace a body farther off: smallest distance, in halves of the body's largest side, and
+relative error along one axis. A cube and a disc have 8. Gradients of their fields have an error of up to 3e-3 there,
+which falls off with the fourth power of the distance."""
 
 
 @dataclass(frozen=True)
@@ -89,13 +93,18 @@ class Polyhedron:
 class Moments:
     """Moments at Gauss points that replace a body at a distance; there, gradients of their field have an error of 1e-3.
 
-    Lattice cells that are not cubes, or that a surface cuts, have an error of 1e-2 at any distance.
+    Lattice cells that are not cubes, or that a surface cuts, have an error of 1e-2 at any distance. Beyond a larger
+    distance, the few moments of :func:`far_box_moments` and :func:`far_cylinder_moments` do.
     """
 
     positions: np.ndarray  # [m], shape [n, 3]
     volumes: np.ndarray  # [m³], shape [n]
     depths: np.ndarray  # depths below the surface of the body [m], shape [n]
     reach: float  # smallest distance from the surface at which the moments replace the body [m]
+
+    def posed(self, position, rotation) -> "Moments":
+        """Return the moments rotated by a matrix and then moved by ``position`` [m]."""
+        return replace(self, positions=self.positions @ np.asarray(rotation).T + position)
 
 
 def box(half_extents) -> Polyhedron:
@@ -115,7 +124,18 @@ def cylinder(radius: float, half_height: float) -> Polyhedron:
 def box_moments(half_extents) -> Moments:
     """Return the moments of a box of half sides ``half_extents`` [m], shape [3], centered at the origin."""
     half = np.asarray(half_extents, float)
-    lines, distance = _planned(half.min(), lambda distance: [_panels_and_points(h, distance) for h in half])
+    return _box_moments(half, *_planned(half.min(), lambda distance: [_panels_and_points(h, distance) for h in half]))
+
+
+def far_box_moments(half_extents) -> Moments:
+    """Return the few moments of a box of half sides ``half_extents`` [m] for large distances, shape [3]."""
+    half = np.asarray(half_extents, float)
+    distance = _FAR_REACH * float(half.max())
+    return _box_moments(half, [_panels_and_points(h, distance, 1, _FAR_REMAINDER) for h in half], distance)
+
+
+def _box_moments(half: np.ndarray, lines, distance: float) -> Moments:
+    """Return moments of a box from (panels, points) per axis, for distances from ``distance`` [m] on."""
     (x, wx), (y, wy), (z, wz) = (_gauss_points_on_line(h, *line) for h, line in zip(half, lines, strict=True))
     positions = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
     shares = (wx[:, None, None] * wy[:, None] * wz).ravel()
@@ -129,7 +149,23 @@ def cylinder_moments(radius: float, half_height: float) -> Moments:
         _, order = _panels_and_points(radius, max(distance, radius / 1e3), 1)
         return [_panels_and_points(half_height, distance), (order // 2 + 1, 2 * order + 1)]
 
-    (line, (rings, around)), distance = _planned(min(radius, half_height), plan)
+    (line, circles), distance = _planned(min(radius, half_height), plan)
+    return _cylinder_moments(radius, half_height, line, circles, distance)
+
+
+def far_cylinder_moments(radius: float, half_height: float) -> Moments:
+    """Return the few moments of a cylinder along z, as :func:`cylinder_moments`, for large distances."""
+    distance = _FAR_REACH * max(radius, half_height)
+    line = _panels_and_points(half_height, distance, 1, _FAR_REMAINDER)
+    return _cylinder_moments(radius, half_height, line, (1, 4), distance)  # a ring is exact to third order
+
+
+def _cylinder_moments(radius: float, half_height: float, line, circles, distance: float) -> Moments:
+    """Return moments of a cylinder for distances from ``distance`` [m] on.
+
+    ``line`` are panels and points along the axis, ``circles`` the number of rings and of moments in a ring.
+    """
+    rings, around = circles
     (squared, area), (z, height) = _gauss(rings), _gauss_points_on_line(half_height, *line)
     angle = 2.0 * np.pi / around * np.arange(around)
     r, phi, z = np.meshgrid(radius * np.sqrt(squared), angle, z, indexing="ij")
@@ -150,14 +186,14 @@ def _planned(half: float, plan):
     return plan(distance), distance
 
 
-def _panels_and_points(half: float, distance: float, panels: int = 0) -> tuple[int, int]:
+def _panels_and_points(half: float, distance: float, panels: int = 0, remainder: float = _REMAINDER) -> tuple[int, int]:
     """Return the number of panels of a line of length 2 ``half``, and the number of Gauss points in each.
 
     Half a panel is at most ``distance`` long. The error of n points at that distance falls off as
     exp(−2n arsinh(distance/half a panel)).
     """
     panels = panels or int(np.ceil(half / distance))
-    return panels, max(1, int(np.ceil(-np.log(_REMAINDER) / (2.0 * np.arcsinh(distance * panels / half)))))
+    return panels, max(1, int(np.ceil(-np.log(remainder) / (2.0 * np.arcsinh(distance * panels / half)))))
 
 
 def _gauss_points_on_line(half: float, panels: int, points: int) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.declarations.magnets import Magnet
-from warpmag.engine.magnets.attributes import marked_shapes, unique_rows
+from warpmag.engine.magnets.attributes import NAMESPACE, marked_shapes, unique_rows
 from warpmag.engine.magnets.sampling import BodyLattice, ShapeSampler
 from warpmag.errors import InputError
 
@@ -39,7 +39,10 @@ def find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
     first_rows = np.array([rows[0] for rows in groups])
     worlds, magnet_worlds = _number_worlds(model, shapes[first_rows])
     # single-shape magnets of equal geometry and material share a lattice; other magnets have a kind of their own
-    sampler, single = ShapeSampler(model), np.array([len(rows) == 1 for rows in groups])
+    sampler, single = (
+        ShapeSampler(model, few=_allows_few_moments(model, magnets)),
+        np.array([len(rows) == 1 for rows in groups]),
+    )
     unique_kind = -1 - np.arange(len(groups))
     kinds = np.where(single, sampler.kinds[shapes[first_rows]], unique_kind)
     _, first, lattice_index = np.unique(
@@ -56,6 +59,16 @@ def find_magnets(model: newton.Model) -> tuple[list[BodyMagnet], np.ndarray]:
         BodyMagnet(magnets[pair], body, tuple(shape_of[row] for row in groups[group]), world, lattices[lattice])
         for group, pair, body, world, lattice in table
     ], magnet_worlds
+
+
+def _allows_few_moments(model: newton.Model, magnets: list[Magnet]) -> bool:
+    """Return True if few moments may stand for a permanent magnet with a closed form.
+
+    Fields of coils and field maps are evaluated at the moments of a magnet, and so are fields at magnets with recoil
+    permeability. They vary over a magnet nearby.
+    """
+    has_sources = any(getattr(getattr(model, NAMESPACE, None), "source", ()))
+    return not (has_sources or any(magnet.recoils for magnet in magnets))
 
 
 def _group(bodies: np.ndarray, magnet_of: np.ndarray, magnets: list[Magnet]) -> list[list[int]]:

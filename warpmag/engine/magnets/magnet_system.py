@@ -85,7 +85,9 @@ def _solid_magnet(first: int, magnet: BodyMagnet, movable: bool, part) -> SolidM
     # the response of recoil, 3χ/(3 + χ) = 3 (μ − 1)/(μ + 2)
     lattice, response = magnet.lattice, 3.0 - 9.0 / (2.0 + magnet.magnet.recoil_permeability)
     volume, first = float(lattice.volumes[part.first]), first + part.first
-    return SolidMagnet(first, part.count, volume, magnet.world, part.reach, part.shape, movable, response)
+    return SolidMagnet(
+        first, part.count, volume, magnet.world, part.reach, part.shape, part.moments, movable, response, part.far_reach
+    )
 
 
 def _largest_extent(magnets: list[BodyMagnet], bodies: np.ndarray, movable: np.ndarray) -> float:

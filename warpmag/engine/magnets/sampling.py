@@ -16,7 +16,7 @@ from warpmag.moments.arrays import RADIUS_RANGE
 from warpmag.shapes import lattice, polyhedra
 from warpmag.shapes.demagnetization import Coupling, coupling
 from warpmag.shapes.flat_faces import FlatFaces, faces_of_mesh, faces_of_polyhedron, joined
-from warpmag.shapes.polyhedra import Polyhedron
+from warpmag.shapes.polyhedra import Moments, Polyhedron
 from warpmag.shapes.shape_cache import FOLDER, ShapeCache
 from warpmag.shapes.softening import softened
 from warpmag.shapes.solids import boxes_meet
@@ -46,6 +46,8 @@ class ClosedForm:
     count: int  # number of moments
     shape: Polyhedron  # surface, in the frame of the body
     reach: float  # largest distance at which the closed form is used [m]
+    moments: Moments  # moments at larger distances, in the frame of the body
+    far_reach: float = 0.0  # largest distance at which they are used [m], if the magnet has fewer moments
 
 
 @dataclass(frozen=True)
@@ -64,8 +66,9 @@ class BodyLattice:
 class ShapeSampler:
     """Samples the shapes of one model. Equal shapes, for example instances of a prototype, are sampled once."""
 
-    def __init__(self, model: newton.Model):
-        """Read the geometry of ``model``."""
+    def __init__(self, model: newton.Model, *, few: bool = True):
+        """Read the geometry of ``model``. With ``few``, closed forms let permanent magnets have few moments."""
+        self._few = few
         # a builder that grows after finalize() appends to the same lists
         self._labels, self._sources = model.shape_label, model.shape_source[: model.shape_count]
         self._types, self._scales = model.shape_type.numpy(), model.shape_scale.numpy().astype(float)
@@ -107,7 +110,7 @@ class ShapeSampler:
                 np.concatenate([ball.radii for ball in balls]),
                 np.ones(len(shapes), dtype=int),
             )
-        key = (spacing, fixed, permanent, *(part for shape in shapes for part in self._content(shape)))
+        key = (self._few, spacing, fixed, permanent, *(part for shape in shapes for part in self._content(shape)))
         return self._cache.get(self._labels[shapes[0]], key, lambda: self._fill(shapes, spacing, fixed, permanent))
 
     def _content(self, shape: int) -> tuple:
@@ -128,15 +131,16 @@ class ShapeSampler:
         filled = lattice.fill(solids, spacing, 1 if fixed else lattice.LEAST_ACROSS, together=not fixed)
         counts = np.bincount(filled.owners, minlength=len(solids))
         ends, grids = np.cumsum(counts), filled.pieces if fixed else filled.pieces * len(solids)
-        parts = tuple(
-            ClosedForm(int(end - count), int(count), shape, _REACH * float(grid.sides.max()))
-            for end, count, shape, grid in zip(ends, counts, surfaces, grids, strict=bool(surfaces))
-        )
+        parts = []
+        for end, count, shape, grid in zip(ends, counts, surfaces, grids, strict=bool(surfaces)):
+            own, reach = slice(end - count, end), _REACH * float(grid.sides.max())
+            moments = Moments(filled.positions[own], filled.volumes[own], filled.inner_radii[own], reach)
+            parts.append(ClosedForm(int(end - count), int(count), shape, reach, moments))
         if fixed:
-            return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solids=parts)
+            return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solids=tuple(parts))
         cells = with_surface_response(softened(coupling(filled, filled.radii), filled), filled, solids)
         faces = None if permanent else joined([self._faces(*pair) for pair in zip(shapes, solids, strict=True)])
-        return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells, parts, faces)
+        return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells, tuple(parts), faces)
 
     def _faces(self, shape: int, solid: lattice.Solid) -> FlatFaces:
         """Return the flat faces of a box, a cylinder or a mesh in the frame of its body; none of other shapes."""
@@ -169,11 +173,17 @@ class ShapeSampler:
         for shape, solid, surface in zip(shapes, solids, surfaces, strict=True):
             scale, box = self._scales[shape], self._types[shape] == newton.GeoType.BOX
             moments = polyhedra.box_moments(scale) if box else polyhedra.cylinder_moments(scale[0], scale[1])
-            positions.append(solid.to_body(moments.positions))
-            volumes.append(moments.volumes)
-            radii.append(np.minimum(0.5 * np.cbrt(moments.volumes), moments.depths))
-            parts.append(ClosedForm(first, len(moments.volumes), surface, moments.reach))
-            first += len(moments.volumes)
+            moments = moments.posed(solid.position, solid.rotation)
+            own, own_radii = moments, np.minimum(0.5 * np.cbrt(moments.volumes), moments.depths)
+            if self._few:
+                own = polyhedra.far_box_moments(scale) if box else polyhedra.far_cylinder_moments(scale[0], scale[1])
+                own = own.posed(solid.position, solid.rotation)
+                own_radii = np.full(len(own.volumes), own_radii.max())  # larger balls would overlap more of others
+            positions.append(own.positions)
+            volumes.append(own.volumes)
+            radii.append(own_radii)
+            parts.append(ClosedForm(first, len(own.volumes), surface, moments.reach, moments, own.reach))
+            first += len(own.volumes)
         counts = np.array([part.count for part in parts])
         return BodyLattice(
             np.concatenate(positions), np.concatenate(volumes), np.concatenate(radii), counts, solids=tuple(parts)
