@@ -62,6 +62,7 @@ class AppliedField:
         field: Magnetizing field: base and the field of all sources [A/m], shape [t].
         acting: Field that exerts torques: base and the field of other bodies' sources [A/m], shape [t].
         along: Derivatives of the field of other bodies' sources along x, y and z [A/m²], shape [t] each.
+        evaluated: True for targets at which :meth:`launch` evaluates these, NumPy, shape [t].
     """
 
     balls: tuple = (0, 0.0, 0.0, 0)
@@ -95,7 +96,7 @@ class AppliedField:
         sources, targets, corrected = self.sources, self.arrays.targets, np.ones(self.count, int)
         for solid in () if self._points else sources.solids:
             corrected[solid.first : solid.first + solid.count] = 0
-        targets.kind = self._integers(corrected + 2 * magnetized)
+        targets.kind, self.evaluated = self._integers(corrected + 2 * magnetized), needed
         targets.chunk, targets.lists = self._chunks(worlds, needed)
         self._left_out = self._chunks(worlds, ~needed)
 

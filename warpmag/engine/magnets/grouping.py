@@ -65,10 +65,10 @@ def _allows_few_moments(model: newton.Model, magnets: list[Magnet]) -> bool:
     """Return True if few moments may stand for a permanent magnet with a closed form.
 
     Fields of coils and field maps are evaluated at the moments of a magnet, and so are fields at magnets with recoil
-    permeability. They vary over a magnet nearby.
+    permeability. They vary over a magnet nearby. Gradients know the pairs of moments alone.
     """
     has_sources = any(getattr(getattr(model, NAMESPACE, None), "source", ()))
-    return not (has_sources or any(magnet.recoils for magnet in magnets))
+    return not (has_sources or model.requires_grad or any(magnet.recoils for magnet in magnets))
 
 
 def _group(bodies: np.ndarray, magnet_of: np.ndarray, magnets: list[Magnet]) -> list[list[int]]:

@@ -46,7 +46,7 @@ def _closed_forms_act(system: MomentSystem) -> bool:
         return False
     if sources.applied or system.device.is_capturing:
         return True
-    corrected = interaction.field.numpy() != system.external_field.numpy()
+    corrected = (interaction.field.numpy() != system.external_field.numpy())[interaction.evaluated]
     return bool(corrected.any() or interaction.wrenches.numpy().any())
 
 
