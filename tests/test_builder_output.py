@@ -141,6 +141,10 @@ def test_its_stage_has_joints_and_coils(device, tmp_path):
         np.testing.assert_allclose(record.parameters, expected.parameters, rtol=1e-6)
         np.testing.assert_allclose(record.table, expected.table, rtol=1e-5, atol=1e-6)
     currents = [run.magnetics.coils.currents.numpy()[0] for run in (simulation, again)]
+    stage = Usd.Stage.Open(str(tmp_path / "out.usda"))
+    written = [prim.GetAttribute("warpmag:coil:current") for prim in stage.Traverse()]
+    (samples,) = (attribute for attribute in written if attribute and attribute.HasAuthoredValue())
+    assert samples.Get(20.0) == pytest.approx(currents[0], rel=1e-6)
     assert currents[1] == pytest.approx(currents[0], rel=1e-4) and currents[0] > 0.4
 
 

@@ -9,6 +9,7 @@ from pxr import Usd, UsdGeom
 
 import warpmag
 from warpmag import cli
+from warpmag.declarations.attributes import attributes_of
 from warpmag.declarations.coils import Coil, FieldMap
 from warpmag.declarations.schemas import COIL_SCHEMA, FIELD_MAP_SCHEMA
 from warpmag.errors import InputError
@@ -23,6 +24,7 @@ def Sphere "Ball" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsCollisio
 }
 """
 COILS = {
+    "/Driven": Coil(radius=0.25, resistance=2.5, voltage=-0.5, turns=30.0, inductance=0.125),
     "/Loop": Coil(radius=0.25, wire_radius=0.125, ampere_turns=-2.5),
     "/Solenoid": Coil("solenoid", radius=0.25, length=2.0, ampere_turns=1e3),
     "/Polyline": Coil("polyline", points=((0.0, 0.0, 0.0), (1.0, 0.5, 0.0), (0.0, 0.0, 2.0))),
@@ -67,7 +69,7 @@ def test_every_attribute_survives_the_round_trip(tmp_path, suffix):
     assert (read.origin, read.spacing, read.factor) == (MAP.origin, MAP.spacing, MAP.factor)
     np.testing.assert_array_equal(read.values, VALUES)
     authored = {attribute.GetName() for attribute in stage.GetPrimAtPath("/Loop").GetAuthoredAttributes()}
-    assert authored == {row.usd_name for row in COIL_SCHEMA.attributes}
+    assert authored == {row.usd_name for row in attributes_of(Coil)}  # a run writes the current
 
 
 def test_fallbacks_are_the_defaults_of_the_records():
@@ -75,7 +77,7 @@ def test_fallbacks_are_the_defaults_of_the_records():
     coil, field_map = (UsdGeom.Xform.Define(stage, name).GetPrim() for name in ("/Coil", "/Map"))
     coil.AddAppliedSchema("WarpmagCoilAPI")
     field_map.AddAppliedSchema("WarpmagFieldMapAPI")
-    assert read_fields(coil, COIL_SCHEMA.attributes) == dataclasses.asdict(Coil())
+    assert read_fields(coil, COIL_SCHEMA.attributes) == dataclasses.asdict(Coil()) | {"current": 0.0}
     assert read_fields(field_map, FIELD_MAP_SCHEMA.attributes) == {"origin": (0.0, 0.0, 0.0), "factor": 1.0}
 
 
@@ -157,6 +159,10 @@ def test_a_stage_drives_a_coil_by_voltages(tmp_path, device):
         simulation = warpmag.Simulation(path, device=device, dt=1e-3)
         simulation.run(4, output=output, resume=last == 9, on_frame=lambda frame, last=last: frame < last)
     currents = simulation.magnetics.coils.currents.numpy()
+    stage = Usd.Stage.Open(str(output))
+    attribute = stage.GetPrimAtPath("/Thing").GetAttribute("warpmag:coil:current")
+    assert len(attribute.GetTimeSamples()) == 5 and attribute.Get(0.0) == 0.0
+    assert attribute.Get(4.0) == pytest.approx(currents[0], rel=1e-6)
     uninterrupted = warpmag.Simulation(path, device=device, dt=1e-3)
     uninterrupted.run(4)
     assert np.array_equal(uninterrupted.magnetics.coils.currents.numpy(), currents)
@@ -165,6 +171,17 @@ def test_a_stage_drives_a_coil_by_voltages(tmp_path, device):
     frame = 1.0 / 24.0  # a ramp of one frame, then three at 6 V
     end = 2.0 - 2.0 / (rate * frame) * (1.0 - np.exp(-rate * frame))
     assert currents[0] == pytest.approx(2.0 + (end - 2.0) * np.exp(-3.0 * rate * frame), rel=2e-3)
+
+
+def test_a_run_starts_from_the_current_of_an_earlier_one(tmp_path, device):
+    """A superconducting coil keeps its current, which the stage gives as the result of a run does."""
+    circuit = coil(
+        *("float warpmag:coil:radius = 0.04", "float warpmag:coil:resistance = 1e-9", "float warpmag:coil:turns = 50"),
+        "double warpmag:coil:current.timeSamples = { 0: 2, 24: 3 }",
+    )
+    simulation = warpmag.Simulation(write(tmp_path, circuit), device=device)
+    assert simulation.magnetics.coils.currents.numpy()[0] == pytest.approx(2.0)
+    assert simulation.model.warpmag.strength.numpy().max() == pytest.approx(100.0)
 
 
 def test_check_tells_what_a_stage_holds(tmp_path, capsys):

@@ -107,6 +107,7 @@ AUTHORED = {
     "warpmag:coil:voltage": "float",
     "warpmag:coil:turns": "float",
     "warpmag:coil:inductance": "float",
+    "warpmag:coil:current": "double",
     "warpmag:fieldMap:origin": "point3f",
     "warpmag:fieldMap:spacing": "vector3f",
     "warpmag:fieldMap:counts": "int3",

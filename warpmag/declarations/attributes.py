@@ -21,7 +21,7 @@ class Attribute:
     """One row of the table."""
 
     name: str  # in USD, without the namespace
-    usd_type: str  # ``token``, ``float``, ``bool``, ``vector3f``, ``point3f``, ``int3`` or an array of them
+    usd_type: str  # ``token``, ``float``, ``double``, ``bool``, ``vector3f``, ``point3f``, ``int3`` or an array of them
     title: str  # name in user interfaces
     doc: str  # meaning, in one or two sentences
     unit: str = ""  # as USD's own schemas write it, empty for tokens and flags; ``distance`` means the stage's unit

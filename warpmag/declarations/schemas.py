@@ -41,7 +41,14 @@ COIL_SCHEMA = Schema(
     Coil,
     "Makes a prim with a transform a coil. Its field acts on magnets. The coil moves with the nearest rigid body at or "
     "above the prim, and the reaction acts on that body. Loops and solenoids are about the z axis of the prim.",
-)
+    usd_only=(
+        Attribute(
+            "coil:current", "double", "Current",
+            "Current of a coil with a resistance, time-sampled; a run writes it, and starts from it where it is given.",
+            unit="ampere", field="current", default=0.0,
+        ),
+    ),
+)  # fmt: skip
 
 FIELD_MAP_SCHEMA = Schema(
     "WarpmagFieldMapAPI",

@@ -37,6 +37,7 @@ _SET_BY_CURVE = ("saturation", "susceptibility", "curve")
 _READERS: dict[str, Callable[[str, Any], Any]] = {
     "token": text,
     "float": number,
+    "double": number,
     "bool": flag,
     "vector3f": vector,
     "point3f": vector,

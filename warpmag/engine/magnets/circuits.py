@@ -24,7 +24,8 @@ class CoilCircuits:
     """The coils of a model whose currents follow from voltages (``kernels.applied.circuits``).
 
     Attributes:
-        labels: Label of each coil, in the order of the arrays: by world, then by shape.
+        shapes: Shape of each coil, in the order of the arrays: by world, then by number.
+        labels: Labels of these shapes.
         currents: Currents at the end of the last step [A], on the device, shape [coils].
         flux: Flux through one turn of each coil [Wb], on the device, float64, shape [coils].
     """
@@ -41,34 +42,33 @@ class CoilCircuits:
                 raise InputError(f"{label}: a coil with a voltage outside all worlds, while several hold magnets")
         circuits.sort(key=lambda k: (applied[k].world, shapes[k]))
         self._system, self._attributes = system, getattr(model, NAMESPACE)
-        self.labels = [model.shape_label[shapes[k]] for k in circuits]
-        self._arrays = self._make_arrays(circuits, [records[k] for k in circuits], [shapes[k] for k in circuits])
+        self.shapes = [shapes[k] for k in circuits]
+        self.labels = [model.shape_label[shape] for shape in self.shapes]
+        self._arrays = self._make_arrays(circuits, [records[k] for k in circuits])
         inductances = _Inductances(model, shapes, records, applied)
         worlds = np.array([applied[k].world for k in circuits])
         self._set_inductances(inductances, circuits, worlds)
         self.currents, self.flux = self._arrays.current, self._arrays.flux
         moments = np.array([system.world_ranges[world] for world in np.unique(worlds)])[:, [0, 2]]
         self._steps = CircuitSteps(self._arrays, system.sources, moments)
-        self._rows = [
-            WorldRows(array, model.shape_world.numpy()[[shapes[k] for k in circuits]]) for array in self._state()
-        ]
+        self._rows = [WorldRows(array, model.shape_world.numpy()[self.shapes]) for array in self._state()]
 
     def _put(self, values, dtype) -> wp.array:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self._system.device)
 
-    def _make_arrays(self, circuits: list[int], records: list[SourceRecord], shapes: list[int]) -> CircuitArrays:
+    def _make_arrays(self, circuits: list[int], records: list[SourceRecord]) -> CircuitArrays:
         """Return the arrays of the circuits, without those of worlds and inductances."""
         windings = [record.circuit for record in records]
         turns, a, count = np.array([winding.turns for winding in windings]), CircuitArrays(), len(circuits)
         a.source, a.shape, a.turns = (
             self._put(circuits, wp.int32),
-            self._put(shapes, wp.int32),
+            self._put(self.shapes, wp.int32),
             self._put(turns, wp.float64),
         )
         a.resistance = self._put([winding.resistance for winding in windings] / turns**2, wp.float64)
         a.voltage, a.strength = self._attributes.voltage, self._attributes.strength
         a.flux, a.fresh = self._put(np.zeros(count), wp.float64), self._put(np.ones(count), wp.int32)
-        a.current = self._put(a.strength.numpy()[shapes] / turns, wp.float32)
+        a.current = self._put(a.strength.numpy()[self.shapes] / turns, wp.float32)
         return a
 
     def _set_inductances(self, inductances: "_Inductances", circuits: list[int], worlds: np.ndarray) -> None:

@@ -6,7 +6,7 @@ import newton
 import numpy as np
 
 from warpmag.declarations.attributes import NAMESPACE
-from warpmag.declarations.coils import SourceRecord
+from warpmag.declarations.coils import Coil, SourceRecord
 from warpmag.declarations.keys import SceneKeys
 from warpmag.declarations.magnets import MagneticSettings, StageMagnets
 from warpmag.engine.magnets.attributes import marked_shapes
@@ -51,7 +51,7 @@ def builder_scene(
     joints, warnings = stage_joints(model)
     for joint in joints:
         made.add_joint(joint)
-    _add_sources(made, model)
+    circuits = _add_sources(made, model)
     return ImportedScene(
         opened=made.stage,
         identical_balls=[],
@@ -60,13 +60,15 @@ def builder_scene(
         magnets=StageMagnets({paths[shape]: magnet for shape, magnet in magnets.items()}, settings),
         bodies=dict(zip(made.bodies, range(model.body_count), strict=True)),
         magnet_shapes={paths[shape]: [shape] for shape in magnets},
+        circuits=circuits,
         keys=SceneKeys({}, {}, {}, {}),
         warnings=tuple(warnings),
     )
 
 
-def _add_sources(made: ModelStage, model: newton.Model) -> None:
-    """Add the coils and the field maps of a model to a stage."""
+def _add_sources(made: ModelStage, model: newton.Model) -> dict[str, int]:
+    """Add the coils and the field maps of a model to a stage; return the shapes of coils with a resistance by path."""
+    circuits = {}
     attributes = getattr(model, NAMESPACE)
     strengths, voltages = attributes.strength.numpy(), attributes.voltage.numpy()
     for shape in [shape for shape, text in enumerate(attributes.source) if text]:
@@ -74,7 +76,10 @@ def _add_sources(made: ModelStage, model: newton.Model) -> None:
             float(strengths[shape]), float(voltages[shape])
         )
         body, pose = int(model.shape_body.numpy()[shape]), model.shape_transform.numpy()[shape]
-        made.add_source(source, model.shape_label[shape], body, pose)
+        path = made.add_source(source, model.shape_label[shape], body, pose)
+        if isinstance(source, Coil) and source.resistance:
+            circuits[path] = shape
+    return circuits
 
 
 def _is_visible(model: newton.Model, shape: int) -> bool:

@@ -54,7 +54,12 @@ class Recorder:
         self._output, self._resumable = output, resumable
         self._pending: tuple[float, bool, dict[str, np.ndarray] | None] | None = None
         state = stepper.state
-        self._host_copies = _HostCopies((state.body_q, state.body_qd, magnetics.sum_moments()))
+        coils = magnetics.coils
+        self._host_copies = _HostCopies(
+            (state.body_q, state.body_qd, magnetics.sum_moments(), *([] if coils is None else [coils.currents]))
+        )
+        row_of_coil = {shape: row for row, shape in enumerate([] if coils is None else coils.shapes)}
+        self._coils = [row_of_coil[shape] for shape in scene.circuits.values()]
         # keyed bodies already have time samples
         recorded = {prim: body for prim, body in scene.bodies.items() if body not in scene.keys.motions}
         self._bodies = np.array(list(recorded.values()), dtype=int)
@@ -65,7 +70,8 @@ class Recorder:
         with errors_on_all_ranks(ranks):
             if is_first_rank(ranks):
                 prims = list(recorded), list(scene.magnet_shapes)
-                self._writer = CacheWriter(scene.stage, output, *prims, instancers=scene.swarms, **writer_options)
+                writer_options |= {"coil_paths": list(scene.circuits), "instancers": scene.swarms}
+                self._writer = CacheWriter(scene.stage, output, *prims, **writer_options)
 
     def resume(self, frames: int, steps: int, step_size: float) -> tuple[bool, bool]:
         """Continue the run at the output; the whole run has ``frames``, and ``steps`` of ``step_size`` [s].
@@ -124,10 +130,11 @@ class Recorder:
             if self._pending is None:
                 return
             (time, due, checkpoint), self._pending = self._pending, None
-            body_q, body_qd, moments = self._host_copies.read()
+            body_q, body_qd, moments, *currents = self._host_copies.read()
             moments = moments[self._shapes]
             totals = np.add.reduceat(moments, self._first_shapes, axis=0) if len(moments) else moments
-            self._writer.add_frame(time, body_q[self._bodies], body_qd[self._bodies], totals)
+            bodies = body_q[self._bodies], body_qd[self._bodies]
+            self._writer.add_frame(time, *bodies, totals, currents[0][self._coils] if currents else ())
             self.written = time
             if due:
                 self._writer.save(checkpoint)

@@ -10,6 +10,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from warpmag.declarations.coils import Coil
 from warpmag.declarations.keys import Keys, SceneKeys
 from warpmag.declarations.magnets import Magnet, StageMagnets
 from warpmag.engine.magnets.attributes import declare_attributes, mark_shapes
@@ -53,6 +54,7 @@ class ImportedScene:
     magnets: StageMagnets
     bodies: dict[str, int]  # body of each rigid-body prim
     magnet_shapes: dict[str, list[int]]  # shapes of each magnet prim
+    circuits: dict[str, int]  # shape of each coil prim with a resistance
     keys: SceneKeys  # keys from time samples
     warnings: tuple[str, ...]  # warnings about the stage, one line each
 
@@ -115,13 +117,15 @@ def _import(path: str | os.PathLike, visuals: bool, time_code: float | None, art
     for joint in grounded:
         _correct_grounded_joint(builder, joint, joints[joint.path], bodies[joint.moving], shapes)
     shapes_of_magnets = _mark_magnets(builder, stage, contents.magnets, bodies, shapes)
-    drives = _add_sources(builder, contents.sources, bodies)
+    drives, circuits = _add_sources(builder, contents.sources, bodies)
     magnets = StageMagnets(contents.magnets, contents.settings, contents.initial_moments)
     keys = _scene_keys(builder, stage, contents, clock, bodies, shapes_of_magnets, drives)
     for balls in identical_balls:
         _copy_balls(builder, stage, balls, bodies, shapes_of_magnets, magnets)
     warnings = tuple(map(str, report.warnings))
-    return ImportedScene(stage, identical_balls, builder, clock, magnets, bodies, shapes_of_magnets, keys, warnings)
+    return ImportedScene(
+        stage, identical_balls, builder, clock, magnets, bodies, shapes_of_magnets, circuits, keys, warnings
+    )
 
 
 def _check_masses(builder: newton.ModelBuilder, stage, contents, bodies: dict[str, int]) -> None:
@@ -229,15 +233,23 @@ def _shape_rotation(builder, stage, prim: str, shape: int, bodies: dict[str, int
     return builder.shape_transform[shape].q if prim in bodies else axis_rotation(shape_axis(stage, prim))
 
 
-def _add_sources(builder: newton.ModelBuilder, sources, bodies: dict[str, int]) -> tuple[dict[int, Keys], ...]:
-    """Add the coils and field maps of a stage to the builder; return keys of currents and of voltages by shape."""
-    currents, voltages = {}, {}
+def _add_sources(
+    builder: newton.ModelBuilder, sources, bodies: dict[str, int]
+) -> tuple[tuple[dict[int, Keys], dict[int, Keys]], dict[str, int]]:
+    """Add the coils and field maps of a stage to the builder.
+
+    Return the keys of currents and of voltages by shape, and the shapes of coils with a resistance by prim.
+    """
+    currents, voltages, circuits = {}, {}, {}
     for source in (source for placed in sources.values() for source in placed):
         body = -1 if source.body is None else bodies[source.body]
         shape = add_placed_source(builder, source, body, wp.transform(source.position, source.rotation))
+        driven = isinstance(source.source, Coil) and bool(source.source.resistance)
+        if driven:
+            circuits[source.prim] = shape
         if source.drive is not None:
-            (voltages if source.source.resistance else currents)[shape] = source.drive
-    return currents, voltages
+            (voltages if driven else currents)[shape] = source.drive
+    return (currents, voltages), circuits
 
 
 def _remove_default_rolling_friction(builder: newton.ModelBuilder) -> None:

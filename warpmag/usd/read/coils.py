@@ -24,6 +24,7 @@ from warpmag.usd.values import Finding, finding_of, instance_finding, number
 
 Source = TypeVar("Source", Coil, FieldMap)
 _AMPERE_TURNS, _VOLTAGE = (COIL_SCHEMA.usd_name(field) for field in ("ampere_turns", "voltage"))
+CURRENT = COIL_SCHEMA.usd_name("current")
 _BORDER_WARNING = 0.05
 """Largest field on the boundary of a map without a warning, as a fraction of its largest field."""
 
@@ -75,7 +76,7 @@ def sources_of(prim: Usd.Prim, transforms: TransformCheck, keys: KeyReader) -> I
         if keys.moves(prim, owner):
             yield Finding(path, f"keys move it within its rigid body {body}: a run holds it still there", "warning")
         if has_api(prim, COIL_SCHEMA.name):
-            coil = Coil(**_read(prim, COIL_SCHEMA))
+            coil = _coil(prim)
             coil.check(path)
             drive = _drive(prim, coil, keys)
             yield PlacedSource(path, _scaled(coil, scale), body, position, rotation, drive)
@@ -126,6 +127,15 @@ def field_map_of(prim: Usd.Prim) -> FieldMap:
     field_map = FieldMap(**fields, values=nodes.reshape(*counts, 3))
     field_map.check(path)
     return field_map
+
+
+def _coil(prim: Usd.Prim) -> Coil:
+    """Return the coil that ``prim`` declares, in its own frame, with the current of an earlier run; not checked."""
+    fields = _read(prim, COIL_SCHEMA)
+    authored = prim.GetAttribute(CURRENT).HasAuthoredValue()
+    current = fields.pop("current", 0.0)
+    coil = Coil(**fields)
+    return replace(coil, ampere_turns=current * coil.turns) if authored and coil.resistance else coil
 
 
 def _read(prim: Usd.Prim, schema: Schema) -> dict:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from warpmag.usd.read.coils import CURRENT
 from warpmag.usd.read.identical_balls import MOMENTS_PRIMVAR
 from warpmag.usd.read.recording import ORIENT, TRANSLATE
 from warpmag.usd.schemas import MOMENT
@@ -37,6 +38,7 @@ BODY = (
 )
 """Attributes of a rigid body, see :class:`warpmag.usd.write.placements.Placed`."""
 MAGNET = _Kind(MOMENT, "vector3f", crate.VEC3F, np.float32, 3)
+CIRCUIT = _Kind(CURRENT, "double", crate.DOUBLE, np.float64, 1)
 INSTANCER = (
     _Kind("positions", "point3f[]", crate.VEC3F, np.float32, 3),
     _Kind("orientationsf", "quatf[]", crate.QUATF, np.float32, 4),

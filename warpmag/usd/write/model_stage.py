@@ -96,13 +96,14 @@ class ModelStage:
         """Add a joint between bodies that were added."""
         author_joint(self.stage, self._new_path("/World", joint.label), joint, self.bodies)
 
-    def add_source(self, source: Coil | FieldMap, label: str, body: int, pose: np.ndarray) -> None:
-        """Add a coil or a field map with a pose in the frame of a body that was added, or in the world, -1."""
+    def add_source(self, source: Coil | FieldMap, label: str, body: int, pose: np.ndarray) -> str:
+        """Add a coil or a field map with a pose in the frame of a body, or for -1 in the world; return its path."""
         path = self._new_path(self.bodies[body] if body >= 0 else "/World", label)
         xform = UsdGeom.Xform.Define(self.stage, path)
         _place(xform, pose)
         author = author_coil if isinstance(source, Coil) else author_field_map
         author(xform.GetPrim(), source)
+        return path
 
     def _new_path(self, parent: str, label: str) -> str:
         """Return a path below ``parent`` that no prim has, named after the last part of a label."""

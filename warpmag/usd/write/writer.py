@@ -15,6 +15,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from pxr import Sdf, Usd, UsdGeom
 
 from warpmag.errors import InputError
@@ -29,7 +30,7 @@ from warpmag.usd.read.session import INSTANCES, added_layer, as_written, instanc
 from warpmag.usd.read.trial_read import trial_read
 from warpmag.usd.read.units import units_of
 from warpmag.usd.write import crate
-from warpmag.usd.write.columns import BODY, MAGNET, Column
+from warpmag.usd.write.columns import BODY, CIRCUIT, MAGNET, Column
 from warpmag.usd.write.instancer_frames import InstancerFrames
 from warpmag.usd.write.output import Output
 from warpmag.usd.write.placements import Placements
@@ -89,6 +90,7 @@ class CacheWriter:
         body_paths: Sequence[str],
         magnet_paths: Sequence[str],
         *,
+        coil_paths: Sequence[str] = (),
         instancers: Sequence[BallInstancer] = (),
         copy_scene: bool = False,
         frames: int | None = None,
@@ -101,6 +103,7 @@ class CacheWriter:
             path: File of the root layer, ``.usd``, ``.usda`` or ``.usdc``.
             body_paths: Paths of the rigid bodies, in the order of the frames' rows.
             magnet_paths: Paths of the magnets, in the order of the frames' moments.
+            coil_paths: Paths of the coils with a resistance, in the order of the frames' currents.
             instancers: Instancers that contain some of the bodies and stay instancers.
             copy_scene: Copy the scene beside the root layer instead of referring to it, as for a bundled scene. A scene
                 without a file or with unsaved edits is always copied.
@@ -121,6 +124,7 @@ class CacheWriter:
         self._instancer_paths = [instancer.path for instancer in instancers]
         self._instancers = [InstancerFrames(instancer) for instancer in instancers]
         self._columns = [Column(kind, self._bodies.paths) for kind in BODY] + [Column(MAGNET, magnets_with_prims)]
+        self._columns.append(Column(CIRCUIT, coil_paths))
         self._columns += [column for instancer in self._instancers for column in instancer.columns]
         self._frames, self._options = frames, options or {}
         self._samples: SampleFile | None = None
@@ -206,7 +210,14 @@ class CacheWriter:
         """Digest of the scene and the options: equal for runs that may continue each other."""
         return {"scene": _digest(self._stage), **self._options}
 
-    def add_frame(self, time: float, body_q: np.ndarray, body_qd: np.ndarray, moments: np.ndarray) -> None:
+    def add_frame(
+        self,
+        time: float,
+        body_q: np.ndarray,
+        body_qd: np.ndarray,
+        moments: np.ndarray,
+        currents: npt.ArrayLike = (),
+    ) -> None:
         """Write one frame; if that fails, the stage keeps the earlier frames.
 
         Args:
@@ -214,6 +225,7 @@ class CacheWriter:
             body_q: Body frames in the world (position [m], quaternion x y z w), shape [n, 7].
             body_qd: Linear velocity of the center of mass [m/s] and angular velocity [rad/s], world, shape [n, 6].
             moments: Moments of the magnets [A·m²], world frame, shape [m, 3].
+            currents: Currents of the coils with a resistance [A], shape [c].
         """
         if not time > self._last_time:
             raise ValueError(f"time must increase from frame to frame: {time} after {self._last_time}")
@@ -223,6 +235,7 @@ class CacheWriter:
         moments = np.asarray(moments, dtype=np.float32).reshape(rows.magnet_count, 3)
         placed = self._bodies.place(body_q[rows.bodies], body_qd[rows.bodies], last and last[1])
         values = [placed.positions, placed.rotations, placed.linear, placed.angular, moments[rows.magnets]]
+        values.append(np.asarray(currents, dtype=np.float64).reshape(-1, 1))
         for instancer, (balls, magnets) in zip(self._instancers, rows.of_instancers, strict=True):
             ball_moments = moments[magnets] if len(moments) else np.zeros((len(magnets), 3), np.float32)
             ball_moments[magnets < 0] = 0.0
