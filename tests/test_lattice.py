@@ -176,6 +176,20 @@ def test_concave_mesh():
     assert not notch.any()
 
 
+@pytest.mark.parametrize("across", [1, lattice.LEAST_ACROSS])
+@pytest.mark.parametrize("stroke", [0.004, 0.0037])
+def test_cells_fit_the_strokes_of_a_letter(stroke, across):
+    """The letter L: whole cells alone, where the number of cells would put its inner faces inside of cells."""
+    outline = np.array([[0, 0], [3, 0], [3, 1], [1, 1], [1, 5], [0, 5]]) * stroke
+    solid = lattice.mesh(*prism(outline, [(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)], 0.004))
+    expected = [[0, stroke, 0.016 * stroke], [1, stroke, 0.008 * stroke]]
+    np.testing.assert_allclose(solid.steps, expected, rtol=2e-5, atol=1e-12)
+    body = lattice.fill(solid, 0.0, across, together=True)
+    cell = body.pieces[0].sides.prod()
+    assert 0.5 * lattice.AUTOMATIC_COUNT < len(body.volumes) <= lattice.AUTOMATIC_COUNT
+    np.testing.assert_allclose(body.volumes, cell, rtol=1e-9)
+
+
 def test_a_mesh_that_is_asked_about_no_point():
     """As a part of a body whose other parts are elsewhere: it raised an error of NumPy."""
     solid = lattice.mesh(*box_mesh((0.01, 0.01, 0.01)))

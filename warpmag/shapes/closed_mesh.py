@@ -11,6 +11,30 @@ _CHUNK = 1 << 18
 """Pairs of a ray and a triangle evaluated at a time (some tens of MB)."""
 
 
+_SAME_PLANE = 1e-5
+"""Relative distance up to which parallel faces are in one plane, and sine up to which they are across an axis."""
+
+
+def steps_of(corners: np.ndarray) -> np.ndarray:
+    """Return the planes across an axis that have triangles, except those that bound the mesh, shape [f, 3].
+
+    A row holds the axis, the coordinate [m] and the area of its triangles [m²]. ``corners`` [m] have the shape
+    [k, 3, 3].
+    """
+    lower, upper = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    size, rows = float((upper - lower).max()), []
+    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = 0.5 * np.linalg.norm(doubled, axis=1)
+    for axis in range(3):
+        height = corners[:, :, axis].mean(axis=1)
+        across = 0.5 * np.abs(doubled[:, axis]) >= (1.0 - _SAME_PLANE) * areas
+        across &= (height > lower[axis] + _SAME_PLANE * size) & (height < upper[axis] - _SAME_PLANE * size)
+        planes, number = np.unique(np.rint(height[across] / (_SAME_PLANE * size)), return_inverse=True)
+        total = np.bincount(number.reshape(-1), areas[across], len(planes))
+        rows.append(np.column_stack([np.full(len(planes), axis), planes * _SAME_PLANE * size, total]))
+    return np.concatenate(rows)
+
+
 def welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the vertices and triangles of a mesh with equal vertices joined and degenerate triangles dropped."""
     points, triangles = np.asarray(vertices, float), np.asarray(faces)
