@@ -24,11 +24,14 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
-from warpmag.kernels.pairs.work_list import TILE_COLUMNS, cpu_tiles, target_rows, tile_size
+from warpmag.kernels.pairs.work_list import TILE_COLUMNS, cpu_tiles, pair_count, target_rows, tile_size
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes
+
+_WARP, _LEAST_SHARED = 32, 256
+"""Threads of a GPU that share a moment with at least this many sources, so that few moments occupy all processors."""
 
 
 @cache
@@ -113,6 +116,8 @@ class PairGradients:
             a.external_field, a.by_external_field = external_field, out[2]
         self.by_external_field = out[-1]
         segments = np.stack([ends[:-1], ends[1:]] * 2, axis=1)
+        several = pair_count(segments) >= _LEAST_SHARED * n
+        self._group = 1 if device.is_cpu else _WARP if several else group_threads(device)
         _, a.begin, a.end = target_rows(segments, device)
         if device.is_cpu:
             tiles, shares, parts, self._threads = cpu_tiles(segments, True, dtype)
@@ -130,6 +135,5 @@ class PairGradients:
             a.torque_cotangents = torque_cotangents
             inputs = [a.packed, force_cotangents, torque_cotangents]
             wp.launch(_cotangents_kernel(dtype), n, inputs=inputs, outputs=[a.cotangents], device=device)
-        group = group_threads(device)
-        kernel = _kernel(dtype, group, self._is_wrench)
-        launch_passes(kernel, 0, 1, a, device=device, threads=self._threads, gpu_threads=group * n)
+        kernel = _kernel(dtype, self._group, self._is_wrench)
+        launch_passes(kernel, 0, 1, a, device=device, threads=self._threads, gpu_threads=self._group * n)
