@@ -175,7 +175,11 @@ def _check(options) -> int:
     errors, warnings = list(map(str, report.errors)), list(map(str, report.warnings))
     if not errors:
         try:
-            warnings = _load(Path(report.path)).warnings()
+            simulation = _load(Path(report.path))
+            from warpmag.engine.magnets.workload import moments_line  # noqa: PLC0415
+
+            warnings = simulation.warnings()
+            print(f"moments     {moments_line(simulation.magnetics)}")
         except InputError as error:
             errors.append(str(error))
     for severity, lines in (("error", errors), ("warning", warnings)):
@@ -353,6 +357,10 @@ def _simulate(simulation, output: Path, options, display, *, copy_scene: bool, r
         return
     for line in statistics.summary(details=options.verbose):
         print(line)
+    if options.verbose:
+        from warpmag.engine.magnets.workload import moments_line  # noqa: PLC0415
+
+        print(f"moments        {moments_line(simulation.magnetics)}")
     print(f"written        {output}")
     _export_beside(output, options)
     _warn([line for line in simulation.warnings() if line not in warnings])

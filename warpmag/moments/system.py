@@ -1,6 +1,6 @@
 """All magnetic moments of a simulation on one device: induction, forces and energy."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -483,6 +483,23 @@ class MomentSystem:
         """Make later launches wait for the near contacts, which run on a stream of their own."""
         if self._near is not None:
             near_pairs.wait(self._near)
+
+    def parts(self) -> dict[str, tuple[Callable[[], None], int]]:
+        """Return launches that repeat parts of the last solve and its forces, and their numbers in it, by name.
+
+        They leave all results but ``h``, which becomes the field without collective responses. Waits for the device.
+        """
+        launches: dict[str, tuple[Callable[[], None], int]] = {"neighbors": (self._packed.find_overlaps, 1)}
+        if self.source_interaction is not None:
+            launches["sources"] = (self.source_interaction.launch, 1)
+        if self._permanent_field.pair_count:
+            launches["permanent moments"] = (self._permanent_field.launch, 1)
+        if self._cell_pairs is not None:
+            launches["pairs of cells"] = (self._cell_pairs.find, 1)
+        if self._inducible_field.count:
+            launches["evaluations"] = (self.evaluate, int(self.evaluations.numpy().max(initial=1)))
+        launches["forces"] = (self.apply_forces, 1)
+        return launches
 
     def field_error(self) -> float:
         """Return the relative error of the fast multipole method's field at sampled moments, or 0 without the method.

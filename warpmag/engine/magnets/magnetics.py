@@ -22,6 +22,7 @@ from warpmag.engine.magnets.magnet_system import KINEMATIC, make_system
 from warpmag.engine.magnets.model_values import ModelValues, magnetic_arrays
 from warpmag.engine.magnets.pose_gradients import ForceGradients
 from warpmag.engine.magnets.sources import ModelSources
+from warpmag.engine.magnets.workload import Workload, workload
 from warpmag.engine.magnets.world_reset import WorldMask, WorldRows
 from warpmag.errors import ConvergenceWarning, InputError, warn_caller
 from warpmag.kernels.rigid.bodies import (
@@ -190,6 +191,11 @@ class Magnetics:
         The reference is the sum over all pairs at 256 random magnets. Waits for the device.
         """
         return self.system.field_error()
+
+    @property
+    def worlds(self) -> np.ndarray:
+        """Newton worlds with magnets, [-1] for a model without worlds; NumPy."""
+        return self._worlds
 
     @property
     def model(self) -> newton.Model:
@@ -562,6 +568,22 @@ class Magnetics:
         self.check_model()
         probe.measure()
         return probe
+
+    def workload(self) -> Workload:
+        """Return the time of a step by part, body and world, with the moments and near cells of each body.
+
+        Parts of the last solve are launched again on their own, on a GPU in graphs. The time of a body is estimated
+        from its share of moments, of pairs and of cells near permanent magnets. Results stay. Waits for the device::
+
+            magnetics.apply(state)
+            print(magnetics.workload())
+
+        Raises:
+            InputError: There is no solve yet.
+        """
+        self._check_solved()
+        self.check_model()
+        return workload(self)
 
     def _check_solved(self) -> None:
         """Raise :class:`InputError` before the first solve, warn if the last one did not converge."""

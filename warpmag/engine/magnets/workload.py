@@ -1,0 +1,104 @@
+"""Number of moments of each body, and the time of a step by part, body and world."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from warpmag.moments.part_times import part_times
+
+_MOST_LINES = 10
+"""Largest number of bodies in the text."""
+
+
+@dataclass(frozen=True)
+class BodyLoad:
+    """One magnet: all its shapes on one body."""
+
+    label: str  # of its first shape
+    world: int  # Newton world, -1 for none
+    kind: str  # ``inducible`` or ``permanent``
+    moments: int
+    near_cells: int  # cells that permanent magnets nearby act on by averages
+    seconds: float  # estimated share of the time of a step [s]
+
+
+@dataclass(frozen=True)
+class Workload:
+    """Time of a step by part, and by body; ``str`` gives both as a table."""
+
+    seconds: dict[str, float]  # time of each part [s]
+    bodies: tuple[BodyLoad, ...]  # the most expensive first
+    evaluations: np.ndarray  # field evaluations of the last solve, shape [worlds with magnets]
+
+    @property
+    def world_seconds(self) -> dict[int, float]:
+        """Estimated time of each Newton world [s]."""
+        worlds: dict[int, float] = {}
+        for body in self.bodies:
+            worlds[body.world] = worlds.get(body.world, 0.0) + body.seconds
+        return worlds
+
+    def __str__(self) -> str:
+        """Return the parts and the most expensive bodies, line by line."""
+        whole = sum(self.seconds.values())
+        lines = [f"{1e3 * whole:10.3f} ms  a step, {self.evaluations.mean():.1f} evaluations of the field"]
+        lines += [f"{1e3 * seconds:10.3f} ms  {part}" for part, seconds in self.seconds.items()]
+        lines += [
+            f"{1e3 * body.seconds:10.3f} ms  {body.label}, world {body.world}: {body.moments} moments, "
+            f"{body.near_cells} near cells"
+            for body in self.bodies[:_MOST_LINES]
+        ]
+        if len(self.bodies) > _MOST_LINES:
+            lines.append(f"{'':13}  and {len(self.bodies) - _MOST_LINES} more bodies")
+        return "\n".join(lines)
+
+
+def workload(magnetics) -> Workload:
+    """Return the workload of the last solve of a ``Magnetics``; see :meth:`Magnetics.workload`."""
+    system, magnets = magnetics.system, magnetics.magnets
+    counts = np.array([len(magnet.lattice.volumes) for magnet in magnets])
+    worlds = np.array([magnet.world for magnet in magnets])
+    firsts = np.cumsum(counts) - counts
+    near = np.add.reduceat(near_cells(system), firsts)
+    evaluations, seconds = system.evaluations.numpy(), part_times(system)
+    in_world = np.bincount(worlds, counts)
+    shares = {
+        "neighbors": counts,
+        "sources": near if near.any() else counts,
+        "evaluations": counts * (in_world * np.maximum(evaluations, 1))[worlds],
+    }
+    pairs = counts * in_world[worlds]
+    of_bodies = np.zeros(len(magnets))
+    for part, time in seconds.items():
+        share = shares.get(part, pairs).astype(float)
+        of_bodies += time * share / share.sum()
+    order, labels = np.argsort(-of_bodies, kind="stable"), magnetics.model.shape_label
+    newton_worlds = magnetics.worlds
+    rows = (
+        (labels[magnets[k].shapes[0]], newton_worlds[worlds[k]], magnets[k].magnet.kind, counts[k], near[k])
+        for k in order
+    )
+    bodies = tuple(
+        BodyLoad(label, int(world), kind, int(count), int(cells), float(of_bodies[k]))
+        for k, (label, world, kind, count, cells) in zip(order, rows, strict=True)
+    )
+    return Workload(seconds, bodies, evaluations)
+
+
+def near_cells(system) -> np.ndarray:
+    """Return 1 for each moment that is a cell near a permanent magnet, shape [n]."""
+    near = np.zeros(system.count, int)
+    interaction = system.source_interaction
+    if interaction is not None and interaction.cell_count:
+        cells = interaction.arrays.cells
+        near[cells.cell.numpy()[:, 0]] = cells.near.numpy() != 0
+    return near
+
+
+def moments_line(magnetics) -> str:
+    """Return the number of moments, and the body that has most of them, in words."""
+    counts = [len(magnet.lattice.volumes) for magnet in magnetics.magnets]
+    largest = int(np.argmax(counts))
+    label = magnetics.model.shape_label[magnetics.magnets[largest].shapes[0]]
+    bodies = f"{len(counts):,} bod{'ies' if len(counts) > 1 else 'y'}"
+    return f"{sum(counts):,} of {bodies}, at most {counts[largest]:,}: {label}"
