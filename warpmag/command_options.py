@@ -150,7 +150,7 @@ def _add_run(run: argparse.ArgumentParser) -> None:
     add("--viewer", choices=("none", *VIEWERS), default="none", help=text)
     text = "also write a stage for renderers beside the output, as 'warpmag export' does"
     add("--for", dest="purpose", choices=("render",), help=text)
-    add("--verbose", action="store_true", help="also print times per step, field evaluations and buffers")
+    add("--verbose", action="store_true", help="also print times per step, field evaluations, moments and buffers")
 
 
 def _add_render(render: argparse.ArgumentParser) -> None:
