@@ -25,6 +25,7 @@ R, M, MASS = 0.005, 1e6, 0.004  # radius [m], magnetization [A/m] and mass [kg] 
 MOMENT = 4 / 3 * np.pi * R**3 * M  # A·m²
 LOOP, HALL, NEEDLE = 0.05, 0.05, 0.1  # radius of the coil around the origin, heights of sensor and needle [m]
 CURRENT, DT = 1000.0, 0.002  # A·turns, s
+RESISTANCE, INDUCTANCE = 0.5, 2e-3  # of a second coil, Ω and H
 
 
 def on_axis(current, z):
@@ -90,6 +91,9 @@ def environment(tmp_path_factory):
     with launch_simulation(cfg, {"visualizer": "none"}):
         magnets = Magnets()
         magnets.add_coil("coil", shape="loop", radius=LOOP, ampere_turns=CURRENT)
+        aside = (0.5, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
+        circuit = {"resistance": RESISTANCE, "inductance": INDUCTANCE, "voltage": 1.0}
+        magnets.add_coil("driven", shape="loop", radius=0.01, xform=aside, **circuit)
         magnets.add_magnetometer("hall", xform=((0.0, 0.0, HALL), (0.0, 0.0, 0.0, 1.0)))
         environment = Environment(cfg)
         environment.magnets = magnets
@@ -133,6 +137,26 @@ def test_forces_act_in_every_substep(environment):
     assert np.allclose(speeds, [0.0, expected, -expected], rtol=1e-3, atol=1e-6)
 
 
+def test_currents_follow_from_voltages(environment):
+    """Of each environment, in every substep; a reset returns to the voltage of the declaration."""
+    magnets, steps = environment.magnets, 3
+    environment.reset()
+    magnets.reset()
+    magnets.set_voltage("driven", torch.tensor([2.0, -1.0]), torch.tensor([0, 1]))
+    for _ in range(steps):
+        environment.step_once()
+    voltages = np.array([2.0, -1.0, 1.0])
+    expected = voltages / RESISTANCE * (1.0 - np.exp(-RESISTANCE / INDUCTANCE * steps * DT))
+    currents = magnets.magnetics.coils.currents
+    assert np.allclose(currents.numpy(), expected, rtol=1e-3)  # the needle and the other coil link little flux
+    magnets.reset([0])
+    assert currents.numpy()[0] == 0.0 and magnets.magnetics.model.warpmag.voltage.numpy().max() == 1.0
+    with pytest.raises(InputError, match=r"^set_voltage: 'coil' has no resistance"):
+        magnets.set_voltage("coil", 1.0)
+    with pytest.raises(InputError, match=r"^set_current: 'driven' has a voltage"):
+        magnets.set_current("driven", 1.0)
+
+
 def test_a_second_start_of_the_physics_replaces_the_first(environment):
     magnets, first = environment.magnets, environment.magnets.magnetics
     environment.sim.reset()
@@ -144,7 +168,7 @@ def test_a_second_start_of_the_physics_replaces_the_first(environment):
 
 def test_bad_names_and_shapes_are_refused(environment):
     magnets = environment.magnets
-    with pytest.raises(InputError, match=r"^set_current: 'coils' is unknown, there are coil$"):
+    with pytest.raises(InputError, match=r"^set_current: 'coils' is unknown, there are coil, driven$"):
         magnets.set_current("coils", 1.0)
     with pytest.raises(InputError, match=r"^readings: 'coil' is unknown"):
         magnets.readings("coil")
