@@ -14,6 +14,7 @@ from warpmag.kernels.pairs import evaluate
 from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.shared import team
+from warpmag.moments.layout import make_layout
 
 MS = 1.7e6
 
@@ -462,3 +463,33 @@ def test_two_runs_are_bitwise_equal(dtype, device):
         system.apply_forces()
         results.append((system.moments.numpy(), system.forces.numpy()))
     assert all(np.array_equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_large_bodies_leave_out_their_own_pairs():
+    """At the start and the end of a world, alone in a world, and as small bodies, which are summed with others."""
+    bodies = np.concatenate([np.full(20, 0), np.full(3, 1), np.full(30, 2), np.full(40, 3), np.arange(4, 9)])
+    worlds = np.concatenate([np.zeros(53, int), np.ones(40, int), np.full(5, 2)])
+    layout = make_layout(np.ones(98), worlds, None, bodies, None, wp.float32)
+    movable = np.ones(98, bool)
+    movable[[5, 60]] = False
+    assert layout.wrench_runs(movable) == [
+        *((0, 5, 20, 53), (6, 20, 20, 53), (20, 23, 0, 53), (23, 53, 0, 23)),
+        *((53, 60, 92, 93), (61, 93, 92, 93)),
+        (93, 98, 93, 98),
+    ]
+
+
+def test_forces_without_own_pairs_are_those_of_all_pairs(device):
+    """Two bodies of 20 moments and one of 3, against the oracle."""
+    rng = np.random.default_rng(3)
+    bodies = np.concatenate([np.full(20, 0), np.full(3, 1), np.full(20, 2)])
+    positions, moments = 0.01 * rng.normal(size=(43, 3)) + 0.1 * bodies[:, None], rng.normal(size=(43, 3))
+    radii, permanent = np.full(43, 1e-4), np.ones(43, bool)
+    system = moment_system(radii=radii, permanent=permanent, bodies=bodies, dtype="float64", device=device)
+    system.positions.assign(positions)
+    system.moments.assign(moments)
+    system.solve()
+    system.apply_forces()
+    gradients = oracle.field_gradient(positions, moments, bodies=bodies)
+    forces = oracle.kelvin_force(moments, gradients)
+    np.testing.assert_allclose(system.forces.numpy(), forces, atol=1e-12 * np.abs(forces).max())

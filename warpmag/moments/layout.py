@@ -14,6 +14,9 @@ from warpmag.errors import InputError
 from warpmag.kernels.material.curves import CURVE_IDS, FIRST_TABLE, LINEAR, MIXED, CurveParameters, curve_tables
 from warpmag.moments.arrays import check_bodies, host_positive, host_radii, host_scalars, shape_message
 
+_LARGE_BODY = 16
+"""Fewest moments of a body whose forces on itself are left out of sums. Small bodies are summed faster with others."""
+
 
 @dataclass(frozen=True)
 class MomentLayout:
@@ -49,6 +52,30 @@ class MomentLayout:
         last = np.flatnonzero(selected & ~(padded[2:] & continues[1:])) + 1
         world = self.worlds[first]
         return _rows(first, last, edges[world], edges[world + 1])
+
+    def wrench_runs(self, selected: np.ndarray) -> list[tuple[int, int, int, int]]:
+        """Return :meth:`runs` as (first, end, first source, end of sources), without pairs that exert no force.
+
+        A large body at the start or the end of its world's moments, as lone bodies of cells are, leaves out its own
+        moments.
+        """
+        rows = []
+        for first, last, begin, end in self.runs(selected):
+            bodies = self.bodies[begin:end]
+            front, back = (int(np.argmax(np.append(own != own[0], True))) for own in (bodies, bodies[::-1]))
+            front, back = (count if count >= _LARGE_BODY else 0 for count in (front, back))
+            if front == end - begin:  # a lone body
+                rows.append((first, last, end - 1, end))
+                continue
+            parts = (
+                (begin, begin + front, begin + front, end),
+                (begin + front, end - back, begin, end),
+                (end - back, end, begin, end - back),
+            )
+            rows += [
+                (max(a, first), min(b, last), *sources) for a, b, *sources in parts if max(a, first) < min(b, last)
+            ]
+        return rows
 
     def _edges(self) -> np.ndarray:
         """Return the first moment of each world, and the end of the last world."""

@@ -258,8 +258,9 @@ class MomentSystem:
     def _make_wrench(self, layout: MomentLayout, rotatable):
         """Prepare forces on movable moments for each force law, and torques of the moments that ``rotatable`` marks."""
         self._rotatable = wp.array(rotatable.astype(np.int32), dtype=wp.int32, device=self.device)
-        segments = [np.reshape(layout.runs(layout.movable & rows), (-1, 4)) for rows in (~rotatable, rotatable)]
-        all_segments = np.concatenate(segments)
+        mutual, rotating = layout.runs(layout.movable & ~rotatable), layout.movable & rotatable
+        segments = [np.reshape(rows, (-1, 4)) for rows in (mutual, layout.wrench_runs(rotating))]
+        all_segments = np.reshape(mutual + layout.runs(rotating), (-1, 4))
         pairs = pair_count(all_segments)
 
         def evaluations(force, effective):
@@ -498,8 +499,7 @@ class MomentSystem:
             launches["pairs of cells"] = (self._cell_pairs.find, 1)
         if self._inducible_field.count:
             launches["evaluations"] = (self.evaluate, int(self.evaluations.numpy().max(initial=1)))
-        launches["forces"] = (self.apply_forces, 1)
-        return launches
+        return {**launches, "forces": (self.apply_forces, 1)}
 
     def field_error(self) -> float:
         """Return the relative error of the fast multipole method's field at sampled moments, or 0 without the method.
