@@ -105,6 +105,29 @@ def test_state_on_another_device(name, world):
         OF_STATES[name](world, other_model("cpu", 3).state())
 
 
+@pytest.mark.cuda
+@pytest.mark.parametrize("other", ["cpu", "cuda:1"])
+def test_models_on_two_devices(other, device):
+    """They are evaluated in turns: equal results, each on its own device, and Warp's own device stays."""
+    if other not in [str(place) for place in wp.get_devices()] or not device.startswith("cuda"):
+        pytest.skip("needs a second GPU" if other != "cpu" else "needs a GPU")
+    before, worlds, results = wp.get_device(), (World(device), World(other)), []
+    for world in (*worlds, *worlds):
+        state = world.model.state()
+        world.magnetics.apply(state)
+        assert state.body_f.device == world.model.device
+        results.append((world.magnetics.b_field([(0.0, 0.0, 0.05), (0.02, 0.0, 0.0)]), state.body_f.numpy()))
+    for result in results[1:]:
+        for value, expected in zip(result, results[0], strict=True):
+            tolerance = 2e-3 * np.abs(expected).max()  # that of the induction
+            np.testing.assert_allclose(value, expected, rtol=0.0, atol=tolerance)
+    for call in OF_STATES.values():
+        for world, stranger in (worlds, worlds[::-1]):
+            with pytest.raises(warpmag.InputError, match=r"^state: body_q: must be .* on "):
+                call(world, stranger.model.state())
+    assert wp.get_device() == before
+
+
 @pytest.mark.parametrize("array", ["body_f", "body_qd"])
 @pytest.mark.parametrize("wrong", [None, 1, 7])
 def test_wrong_forces_and_velocities(array, wrong, world):

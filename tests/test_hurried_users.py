@@ -1,5 +1,6 @@
 """Programs of hurried users: they ask early or twice, pass other libraries' arrays, and stop too soon."""
 
+import contextlib
 import copy
 import math
 import pickle
@@ -252,6 +253,42 @@ def test_sizes_of_magnetic_shapes(shape, size):
     for add in (warpmag.add_inducible, lambda *a, **k: warpmag.add_permanent(*a, magnetization=M, **k)):
         with pytest.raises(warpmag.InputError, match=r"^shape_0: sizes must be from 1e-08 to 20000 m, got "):
             add(builder, body=body)
+
+
+SLENDER = {
+    "foil": lambda builder, body: builder.add_shape_box(body, hx=1e4, hy=1e4, hz=1e-7),
+    "strip": lambda builder, body: builder.add_shape_box(body, hx=1e-7, hy=1e-3, hz=1e3),
+    "wire": lambda builder, body: builder.add_shape_cylinder(body, radius=1e-7, half_height=1e3),
+    "disc": lambda builder, body: builder.add_shape_cylinder(body, radius=1e4, half_height=1e-7),
+    "needle": lambda builder, body: builder.add_shape_ellipsoid(body, rx=1e-7, ry=1e-7, rz=1e3),
+}
+
+
+@pytest.mark.filterwarnings("ignore:Inertia validation")
+@pytest.mark.parametrize("permanent", [False, True])
+@pytest.mark.parametrize("shape", SLENDER)
+def test_shapes_slender_beyond_all_measure(shape, permanent):
+    """Their counts of cells exceed 64 bits, and their matrices are singular: few moments, or one line."""
+    builder = new_builder()
+    SLENDER[shape](builder, body := builder.add_body())
+    if permanent:
+        warpmag.add_permanent(builder, body=body, magnetization=M)
+    else:
+        warpmag.add_inducible(builder, body=body, material="iron")
+    with contextlib.suppress(warpmag.InputError):
+        assert warpmag.Magnetics(builder.finalize(device="cpu")).shape_volumes.shape == (1,)
+
+
+def test_a_spacing_too_fine_for_a_wide_shape_beside():
+    """It would need billions of test points, which took gigabytes."""
+    builder = new_builder()
+    body = builder.add_body()
+    builder.add_shape_box(body, hx=0.01, hy=0.01, hz=0.01)
+    tilted = wp.transform((1.0, 0.0, 0.0), wp.quat_rpy(0.3, 0.4, 0.5))
+    builder.add_shape_box(body, xform=tilted, hx=20.0, hy=20.0, hz=1e-5)
+    warpmag.add_inducible(builder, body=body, moment_spacing=0.02)
+    with pytest.raises(warpmag.InputError, match="^shape_0: spacing: cells of .* would need .* test points: give"):
+        warpmag.Magnetics(builder.finalize(device="cpu"))
 
 
 def test_a_probe_of_as_many_points_as_numpy_counts(device):

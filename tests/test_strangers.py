@@ -302,6 +302,51 @@ def test_a_signal_ends_native_code(name, tmp_path):
     assert time.monotonic() - began < 20.0  # one second, on a loaded machine
 
 
+SLOW_MODULE = """import os, signal, sys, time
+try:
+    os.kill(os.getpid(), {number})
+    time.sleep(5.0)
+except BaseException:
+    print("went on")
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGHUP"])
+def test_a_signal_during_an_import(name, tmp_path):
+    """Native modules that are half imported swallow exceptions or raise others, and a run would go on."""
+    number = int(getattr(signal, name))
+    (tmp_path / "slow_module.py").write_text(SLOW_MODULE.format(number=number))
+    program = (
+        "import importlib, signal, sys; from warpmag import cli; sys.path.insert(0, sys.argv[1]);"
+        f"number = signal.Signals({number});"
+        "signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL);"
+        "cli._materials = lambda _: importlib.import_module('slow_module'); sys.exit(cli.main(['materials']))"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    told = "interrupted" if name == "SIGINT" else f"ended by {name}"
+    assert (result.returncode, result.stderr, result.stdout) == (128 + number, f"warpmag: {told}\n", "")
+
+
+def test_an_interrupt_while_the_command_is_imported():
+    """It ends silently, as programs in C do, and the handler is Python's own afterwards."""
+    program = (
+        "import os, signal, sys\n"
+        "class Finder:\n"
+        "    def find_spec(name, *_):\n"
+        "        if name == 'warpmag.command_options' and len(sys.argv) > 1:\n"
+        "            os.kill(os.getpid(), signal.SIGINT)\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "sys.meta_path.insert(0, Finder)\n"
+        "import warpmag.cli\n"
+        "assert signal.getsignal(signal.SIGINT) is signal.default_int_handler"
+    )
+    for arguments, code in (([], 0), (["interrupted"], -signal.SIGINT)):
+        command = [sys.executable, "-c", program, *arguments]
+        result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        assert (result.returncode, result.stderr) == (code, "")
+
+
 @pytest.mark.parametrize(
     ("first", "message"),
     [

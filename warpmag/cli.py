@@ -8,28 +8,32 @@ import sys
 import traceback
 from pathlib import Path
 
-from warpmag.command_options import VIEWERS, make_parser
-from warpmag.declarations.checks import check_positive
-from warpmag.declarations.magnets import PRESETS, check_rtol
-from warpmag.declarations.materials import MATERIALS
-from warpmag.errors import InputError, SimulationError, one_line
-from warpmag.kernel_loading import watch_kernels
-from warpmag.moments.ranks import Ranks, current_ranks, is_first_rank, on_first_rank, without_ranks
-from warpmag.progress import Progress, Waiting
-from warpmag.stopwatch import Stopwatch, process_age
-from warpmag.terminal import (
-    Stopped,
-    collection_paused,
-    log,
-    open_standard_files,
-    quiet_warp,
-    signals_guarded,
-    signals_raised,
-    silence,
-    skip_last_collection,
-)
+from warpmag.terminal import interrupted_silently
 
-BAD_INPUT, FAILED, STOPPED = 2, 1, 128
+with interrupted_silently():
+    from warpmag.command_options import VIEWERS, make_parser
+    from warpmag.declarations.checks import check_positive
+    from warpmag.declarations.magnets import PRESETS, check_rtol
+    from warpmag.declarations.materials import MATERIALS
+    from warpmag.errors import InputError, SimulationError, one_line
+    from warpmag.kernel_loading import watch_kernels
+    from warpmag.moments.ranks import Ranks, current_ranks, is_first_rank, on_first_rank, without_ranks
+    from warpmag.progress import Progress, Waiting
+    from warpmag.stopwatch import Stopwatch, process_age
+    from warpmag.terminal import (
+        STOPPED,
+        Stopped,
+        collection_paused,
+        log,
+        open_standard_files,
+        quiet_warp,
+        signals_guarded,
+        signals_raised,
+        silence,
+        skip_last_collection,
+    )
+
+BAD_INPUT, FAILED = 2, 1
 """Exit codes. 0 is success. A command ended by a signal exits with ``STOPPED`` plus the signal's number."""
 
 _BROWSER_VIEWERS = ("viser", "rerun")

@@ -11,8 +11,11 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
+from types import FrameType
 from typing import Any
 
+STOPPED = 128
+"""A command that a signal ends exits with this plus the signal's number."""
 _PATIENCE = 1.0
 """Time after a signal in which Python has to react, before the command is ended [s]."""
 _GUARD = """
@@ -86,13 +89,38 @@ def react() -> None:
             signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
 
 
+def _is_importing(frame: FrameType | None) -> bool:
+    """Return True if a module is being imported by the code of a frame or by its callers."""
+    while frame and not frame.f_code.co_filename.startswith("<frozen importlib"):
+        frame = frame.f_back
+    return frame is not None
+
+
+@contextlib.contextmanager
+def interrupted_silently() -> Iterator[None]:
+    """End the process at Ctrl-C without a traceback, while the command is imported."""
+    usual = signal.default_int_handler
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not usual:
+        yield
+        return
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, usual)
+
+
 @contextlib.contextmanager
 def signals_raised() -> Iterator[None]:
     """Raise :class:`Stopped` for signals that would end the process. Ignored signals stay ignored."""
 
-    def stop(number, _):
+    def stop(number, frame):
         react()
-        raise Stopped(number)
+        stopped = Stopped(number)
+        if _is_importing(frame):  # native modules that are half imported lose the exception, or turn it into others
+            os.write(2, f"warpmag: {stopped}\n".encode())
+            os._exit(STOPPED + number)
+        raise stopped
 
     defaults = {
         signal.SIGINT: signal.default_int_handler,

@@ -189,7 +189,7 @@ def wild(chance: random.Random, world: dict) -> Any:
             {0: 1.0, 1: 2.0, 2: 3.0},
             view,
         )
-        several = (None, object(), [], {}, (), set(), lambda *_: None, int, [[1.0], [2.0, 3.0]], [None])
+        several = (None, object(), [], {}, (), set(), lambda *_: None, str, [[1.0], [2.0, 3.0]], [None])
         return chance.choice((*several, *odd, range(3), bytearray(3), np.ones(3, bool), np.ones(3, "m8[s]")))
     if kind < 6:
         shape = chance.choice(((), (0,), (1,), (3,), (2, 3), (5, 3), (0, 3), (3, 1), (2, 7), (1, 2, 3), (1000, 3)))

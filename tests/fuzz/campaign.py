@@ -120,6 +120,8 @@ def warm_up(stages: list[Path], command: Callable) -> None:
         for stage in stages:
             output = f"{folder}/{stage.stem}.out.usda"
             code, _, said = command("run", str(stage), "--frames", "1", "--device", "cpu", "-o", output)
+            if code == OK and stage is stages[0]:
+                code, _, said = command("render", str(stage), "-o", f"{folder}/out.png", *_SMALL, "cpu")
             if code != OK:
                 raise RuntimeError(f"{stage}: {said}")
 

@@ -61,6 +61,7 @@ def _make_mesh(prim) -> None:
     prim.typeName = "Mesh"
     points, corners = Gf.Matrix3f(0.01), [0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3]
     values = {
+        "warpmag:momentSpacing": ("float", 0.005),  # ten magnets of 700 cells take minutes for a frame, and rightly
         "points": ("point3f[]", Vt.Vec3fArray([Gf.Vec3f(0.0), *(points.GetRow(k) for k in range(3))])),
         "faceVertexIndices": ("int[]", Vt.IntArray(corners)),
         "faceVertexCounts": ("int[]", Vt.IntArray([3] * 4)),

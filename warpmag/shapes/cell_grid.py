@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from warpmag.errors import InputError
 from warpmag.shapes.solids import Solid, boxes_meet, grid
 
 _FINE_POINTS = 32
@@ -20,6 +21,8 @@ _WIDEST = 1.25
 _DEVIATION = 0.2
 """Cost of a change of the sides, over its squared logarithm: a change by a fifth costs as much as a face of 3 % of the
 cross-section in the middle of a cell."""
+_MOST_POINTS = 1 << 23
+"""Largest number of test points of a shape that are not evaluated in chunks: 200 MB, and a few seconds."""
 _CHUNK = 1 << 18
 """Test points evaluated at a time (some tens of MB)."""
 
@@ -118,7 +121,7 @@ class CellGrid:
         """Return the sorted indices of the cells that the rotated bounding box of a shape reaches into."""
         rotation, extent = np.abs(part.rotation), part.upper - part.lower
         steps = (0.5 * self.sides[:, None] / np.maximum(rotation, 1e-9)).min(axis=0)  # along each axis of the shape
-        points = part.test_points(np.ceil(extent / steps).astype(int))
+        points = part.test_points(self._point_counts(extent / steps))
         index, size = np.floor((points - self.lower) / self.sides).astype(int), self.counts + 4
         index = np.clip(index, -2, self.counts + 1) + 2  # not negative, even of the neighbors
         index = np.stack(np.unravel_index(np.unique(np.ravel_multi_index(tuple(index.T), size)), size), axis=1)
@@ -129,9 +132,20 @@ class CellGrid:
         reach = 0.5 * (extent + self.sides @ rotation) * (1.0 - 1e-9)
         return index[(np.abs(center - 0.5 * (part.lower + part.upper)) < reach).all(axis=1)]
 
+    def _point_counts(self, ratios: np.ndarray) -> np.ndarray:
+        """Return numbers of test points along the axes of a shape, ``ratios`` rounded up; too many raise an error."""
+        counts = np.ceil(ratios)
+        if not counts.prod() <= _MOST_POINTS:
+            sides = " x ".join(f"{side:.2g}" for side in self.sides)
+            raise InputError(
+                f"spacing: cells of {sides} m are too small beside a shape of the body, which would need "
+                f"{counts.prod():.2g} test points: give a larger spacing, or make a body of each shape"
+            )
+        return counts.astype(int)
+
     def _filled_by_thin_shape(self, part: Solid, others: list[Solid], pitch: np.ndarray) -> Filled:
         """Return :meth:`filled` of a thin shape from its own test points, because the grid's points may miss it."""
-        points = part.test_points(np.maximum(np.ceil((part.upper - part.lower) / pitch).astype(int), _MOST_SPLITS))
+        points = part.test_points(self._point_counts(np.maximum((part.upper - part.lower) / pitch, _MOST_SPLITS)))
         point_count, free = _inside(part, others, points)
         points = points[free]
         coordinates = (points - self.lower) / self.sides

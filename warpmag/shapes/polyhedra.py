@@ -11,6 +11,7 @@ needs an integral over its area, ∫ (a − n n·a) dA. Between touching bodies,
 continuous, so that a small interpenetration changes the force only a little.
 """
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -181,7 +182,7 @@ def _planned(half: float, plan):
     The distance is the smallest from ``_REACH * half`` on with a plan of at most :data:`_MOST_MOMENTS` moments.
     """
     distance = _REACH * half
-    while np.prod(plan(distance)) > _MOST_MOMENTS:
+    while math.prod(map(math.prod, plan(distance))) > _MOST_MOMENTS:  # beyond 64 bits for foils
         distance *= 1.1
     return plan(distance), distance
 

@@ -36,7 +36,8 @@ _measured_curves: dict[MagnetizationCurve, int] = {}
 _curve_of_number: dict[int, str | MagnetizationCurve] = dict(enumerate(CURVES))
 """Numbers of measured curves and their inverse, with tokens first: a model stores numbers.
 
-Equal curves share a number. A curve stays as long as the process, because models do not tell when they end.
+Equal curves share a number. A curve stays as long as the process: arrays of models and attributes of builders hold its
+number, and their copies and ends are not announced. One of 20 points takes 2 kB.
 """
 
 

@@ -1,5 +1,6 @@
 """Samples Newton's shapes with moments."""
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -138,7 +139,9 @@ class ShapeSampler:
             parts.append(ClosedForm(int(end - count), int(count), shape, reach, moments))
         if fixed:
             return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solids=tuple(parts))
-        cells = with_surface_response(softened(coupling(filled, filled.radii), filled), filled, solids)
+        cells = softened(coupling(filled, filled.radii), filled)
+        with contextlib.suppress(np.linalg.LinAlgError):  # wires of lengths beyond 1e9 radii keep the cells' response
+            cells = with_surface_response(cells, filled, solids)
         faces = None if permanent else joined([self._faces(*pair) for pair in zip(shapes, solids, strict=True)])
         return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells, tuple(parts), faces)
 
