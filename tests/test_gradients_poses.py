@@ -1,5 +1,7 @@
 """Gradients of the forces on bodies by their poses, through ``Magnetics.apply`` on a tape."""
 
+import itertools
+
 import newton
 import numpy as np
 import pytest
@@ -102,6 +104,67 @@ def test_worlds():
     together = gradient_of(*model_of_balls(worlds=2), poses, seed)
     # rtol of both solves is 1e-5, and the second linear solve of one model starts from the first one's solution
     np.testing.assert_allclose(together, np.concatenate(expected), rtol=0.0, atol=1e-4 * np.abs(together).max())
+
+
+@wp.kernel(module="unique", enable_backward=True)
+def advance(
+    dt: float,
+    inv_mass: wp.array[float],
+    body_f: wp.array[wp.spatial_vector],
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    body_q_out: wp.array[wp.transform],
+    body_qd_out: wp.array[wp.spatial_vector],
+):
+    """Step of the symplectic Euler method, without rotations."""
+    i = wp.tid()
+    v = wp.spatial_top(body_qd[i]) + dt * inv_mass[i] * wp.spatial_top(body_f[i])
+    body_qd_out[i] = wp.spatial_vector(v, wp.vec3())
+    x = wp.transform_get_translation(body_q[i]) + dt * v
+    body_q_out[i] = wp.transform(x, wp.transform_get_rotation(body_q[i]))
+
+
+def test_a_rollout():
+    """A hundred substeps in which three iron balls attract each other, against the same rollout in float64."""
+    builder, dt, steps = new_builder(), 5e-5, 100
+    for position in ((0.0, 0.0, 0.0), (0.001, 0.0125, 0.002), (-0.002, 0.004, 0.0135)):
+        add_ball(builder, position)
+    model = builder.finalize(device="cpu", requires_grad=True)
+    magnetics = warpmag.Magnetics(model, external_field=FIELD, rtol=5e-6)
+    states = [model.state() for _ in range(steps + 1)]
+    with wp.Tape() as tape:
+        for now, after in itertools.pairwise(states):
+            magnetics.apply(now)
+            inputs = [dt, model.body_inv_mass, now.body_f, now.body_q, now.body_qd]
+            wp.launch(advance, 3, inputs=inputs, outputs=[after.body_q, after.body_qd])
+    seed = np.random.default_rng(7).normal(size=(3, 3))
+    states[-1].body_q.grad.assign(np.pad(seed, ((0, 0), (0, 4))))
+    tape.backward()
+    gradient = states[0].body_q.grad.numpy()[:, :3].astype(float)
+    inv_mass, material = model.body_inv_mass.numpy()[:, None].astype(float), magnetics.magnets[0].magnet
+
+    def final(x):
+        v = np.zeros((3, 3))
+        for _ in range(steps):
+            balls = warpmag.solve_induction(
+                x, R, saturation=material.saturation, susceptibility=material.susceptibility, external_field=FIELD,
+                rtol=1e-10, dtype="float64",
+            )  # fmt: skip
+            v = v + dt * inv_mass * balls.wrench()[0]
+            x = x + dt * v
+        return x
+
+    start = model.body_q.numpy()[:, :3].astype(float)
+    end = final(start)
+    assert np.abs(end - start).max() > 3e-4 and np.allclose(states[-1].body_q.numpy()[:, :3], end, atol=1e-7)
+    expected = np.zeros((3, 3))
+    for entry in np.ndindex(3, 3):
+        step = np.zeros((3, 3))
+        step[entry] = 1e-7
+        expected[entry] = np.sum(seed * (final(start + step) - final(start - step))) / 2e-7
+    sizes = np.linalg.norm(gradient), np.linalg.norm(expected)
+    assert np.linalg.norm(gradient - expected) < 1e-4 * sizes[1]
+    assert np.sum(gradient * expected) > 0.99999 * sizes[0] * sizes[1]
 
 
 def test_what_has_no_gradient_raises():
