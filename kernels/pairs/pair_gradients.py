@@ -30,8 +30,9 @@ from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes
 
-_WARP, _LEAST_SHARED = 32, 256
-"""Threads of a GPU that share a moment with at least this many sources, so that few moments occupy all processors."""
+_WARP, _LEAST_SHARED, _MOST_SHARED = 32, 256, 8192
+"""Threads of a GPU that share a moment with at least this many sources, in systems of at most this many moments: so few
+moments occupy all processors, while more moments load the sources less often with smaller groups."""
 
 
 @cache
@@ -116,8 +117,8 @@ class PairGradients:
             a.external_field, a.by_external_field = external_field, out[2]
         self.by_external_field = out[-1]
         segments = np.stack([ends[:-1], ends[1:]] * 2, axis=1)
-        several = pair_count(segments) >= _LEAST_SHARED * n
-        self._group = 1 if device.is_cpu else _WARP if several else group_threads(device)
+        is_shared = device.is_cuda and n <= _MOST_SHARED and pair_count(segments) >= _LEAST_SHARED * n
+        self._group = _WARP if is_shared else group_threads(device)
         _, a.begin, a.end = target_rows(segments, device)
         if device.is_cpu:
             tiles, shares, parts, self._threads = cpu_tiles(segments, True, dtype)
