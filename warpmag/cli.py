@@ -180,10 +180,8 @@ def _check(options) -> int:
     if not errors:
         try:
             simulation = _load(Path(report.path))
-            from warpmag.engine.magnets.workload import moments_line  # noqa: PLC0415
-
             warnings = simulation.warnings()
-            print(f"moments     {moments_line(simulation.magnetics)}")
+            print(f"moments     {simulation.moments_line()}")
         except InputError as error:
             errors.append(str(error))
     for severity, lines in (("error", errors), ("warning", warnings)):
@@ -362,9 +360,7 @@ def _simulate(simulation, output: Path, options, display, *, copy_scene: bool, r
     for line in statistics.summary(details=options.verbose):
         print(line)
     if options.verbose:
-        from warpmag.engine.magnets.workload import moments_line  # noqa: PLC0415
-
-        print(f"moments        {moments_line(simulation.magnetics)}")
+        print(f"moments        {simulation.moments_line()}")
     print(f"written        {output}")
     _export_beside(output, options)
     _warn([line for line in simulation.warnings() if line not in warnings])

@@ -18,6 +18,7 @@ from warpmag.deprecation import renamed_arguments
 from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.caller_checks import check_control
 from warpmag.engine.magnets.magnetics import Magnetics
+from warpmag.engine.magnets.workload import moments_line
 from warpmag.engine.pile_xpbd.contacts import RigidSolver, body_sizes
 from warpmag.engine.pile_xpbd.solvers import SOLVERS, check_solver
 from warpmag.engine.stepping.keyed_values import KeyedModelValues
@@ -289,6 +290,10 @@ class Simulation:
         """Statistics of the run so far; :meth:`finish` adds the final values. Waits for the device."""
         self._read_reports()
         return self._statistics
+
+    def moments_line(self) -> str:
+        """Return the number of moments, and the body that has most of them, in words; nothing is solved for it."""
+        return moments_line(self._magnetics)
 
     def warnings(self) -> list[str]:
         """Return the warnings about the scene and the run so far, one line each; waits for the device."""
