@@ -160,7 +160,7 @@ def test_a_simulation_resets_worlds(device):
     assert np.array_equal(simulation.state.body_q.numpy(), start)
 
 
-@pytest.mark.parametrize("mask", [[1, 0, 0], [True, False], "all", np.ones((3, 1), bool)])
+@pytest.mark.parametrize("mask", [[1, 0, 0], [True, False], "all", [[True], [True, False]], np.ones((3, 1), bool)])
 def test_other_masks_are_refused(mask, device):
     magnetics = warpmag.Magnetics(world_of_touching_balls().finalize(device=device))
     with pytest.raises(warpmag.InputError, match="^worlds: "):

@@ -54,7 +54,7 @@ def main() -> int:
         keep=options.only is not None,
     )
     began = time.monotonic()
-    warm_up([*sources, *author_others(folder / "others")], in_fresh_process)
+    warm_up([*sources, *author_others(folder / "others")], in_fresh_process, options.workers)
     print(f"kernels ready after {time.monotonic() - began:.0f} s", flush=True)
     if not options.fresh:
         warm_up(sources, in_process)

@@ -19,6 +19,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -111,19 +112,29 @@ def make(number: int, seed: int, folder: Path, sources: list[Path]) -> tuple[Pat
     return path, form, f"{source.stem}: {done}"
 
 
-def warm_up(stages: list[Path], command: Callable) -> None:
-    """Run sound stages: in a fresh process to have their kernels compiled, in this one to have them loaded.
+def warm_up(stages: list[Path], command: Callable, together: int = 1) -> None:
+    """Run sound stages: in fresh processes to have their kernels compiled, in this one to have them loaded.
 
-    A fresh one has no limits. Else all workers would compile the same kernels at first, and be killed for it.
+    Fresh ones have no limits, and may run ``together``. Else all workers would compile the same kernels at first, and
+    be killed for it. The first stage is drawn, too.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        for stage in stages:
-            output = f"{folder}/{stage.stem}.out.usda"
-            code, _, said = command("run", str(stage), "--frames", "1", "--device", "cpu", "-o", output)
-            if code == OK and stage is stages[0]:
-                code, _, said = command("render", str(stage), "-o", f"{folder}/out.png", *_SMALL, "cpu")
+
+    def run(stage):
+        commands = [("run", str(stage), "--frames", "1", "--device", "cpu", "-o", f"{folder}/{stage.stem}.out.usda")]
+        if stage is stages[0]:
+            commands.append(("render", str(stage), "-o", f"{folder}/out.png", *_SMALL, "cpu"))
+        for arguments in commands:
+            code, _, said = command(*arguments)
             if code != OK:
                 raise RuntimeError(f"{stage}: {said}")
+
+    with tempfile.TemporaryDirectory() as folder:
+        if together > 1:
+            with ThreadPoolExecutor(together) as pool:
+                list(pool.map(run, stages))
+        else:
+            for stage in stages:
+                run(stage)
 
 
 def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Callable, device: str = "cpu") -> Verdict:

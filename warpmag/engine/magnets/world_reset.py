@@ -44,7 +44,10 @@ class WorldMask:
         if not isinstance(worlds, wp.array | np.ndarray) and hasattr(worlds, "__dlpack__"):
             worlds = _from_dlpack(worlds)
         if not isinstance(worlds, wp.array):
-            values = np.asarray(worlds)
+            try:
+                values = np.asarray(worlds)
+            except Exception:  # a ragged list, or an object that fails to become an array
+                values = np.zeros(0)
             if values.dtype != bool:
                 raise InputError(f"worlds: must be a mask of bools, one for each world, got {short_repr(worlds)}")
             worlds = wp.array(values, dtype=wp.bool, device=self._device)
