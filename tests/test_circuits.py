@@ -249,9 +249,10 @@ def test_repeated_attempts_do_not_repeat_the_circuit(device):
     ({"turns": 20}, "add_coil: turns is given"),
     ({"inductance": 1e-3}, "add_coil: inductance is given"),
     ({"resistance": -1.0}, "add_coil: resistance: must be 0 or"),
-    ({"resistance": 1.0, "turns": 0.0}, "add_coil: turns: must be positive"),
-    ({"resistance": 1.0, "voltage": math.nan}, "add_coil: voltage: must be finite"),
-    ({"resistance": 1.0, "radius": 0.0, "shape": "polyline", "points": np.eye(3), "closed": False}, "open polyline"),
+    ({"resistance": 1.0, "voltage": 12.0}, "add_coil: turns is missing: a coil with a resistance needs their number"),
+    ({"resistance": 1.0, "turns": 1, "voltage": math.nan}, "add_coil: voltage: must be finite"),
+    ({"resistance": 1.0, "turns": 1, "radius": 0.0, "shape": "polyline", "points": np.eye(3), "closed": False},
+     "an open polyline is only a part of a circuit"),
 ])  # fmt: skip
 def test_impossible_circuits_are_errors(arguments, message):
     with pytest.raises(warpmag.InputError, match=message):
@@ -276,8 +277,16 @@ def test_misused_circuits_are_errors(device):
     magnetics.apply(state, 1e-4)
     assert magnetics.coils.labels == ["coil"]
     assert magnetics.coils.currents.numpy()[0] == pytest.approx(1e-4 / 0.5, rel=0.01)  # the inductance given
+    lone = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    without = new_builder(gravity=(0.0, 0.0, 0.0))
+    without.add_body()
+    warpmag.add_coil(without, **LOOP, resistance=1.0, turns=5, label="lone")
+    for world in (coil_and_ball(LOOP), without):
+        lone.add_world(world)
+    with pytest.raises(warpmag.InputError, match="lone: a coil with a voltage in a world without magnets"):
+        warpmag.Magnetics(lone.finalize(device=device))
     everywhere = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     everywhere.replicate(coil_and_ball(LOOP), 2)
-    warpmag.add_coil(everywhere, **LOOP, resistance=1.0, label="outside")
+    warpmag.add_coil(everywhere, **LOOP, resistance=1.0, turns=5, label="outside")
     with pytest.raises(warpmag.InputError, match="outside: a coil with a voltage outside all worlds"):
         warpmag.Magnetics(everywhere.finalize(device=device))

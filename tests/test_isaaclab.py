@@ -92,7 +92,7 @@ def environment(tmp_path_factory):
         magnets = Magnets()
         magnets.add_coil("coil", shape="loop", radius=LOOP, ampere_turns=CURRENT)
         aside = (0.5, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
-        circuit = {"resistance": RESISTANCE, "inductance": INDUCTANCE, "voltage": 1.0}
+        circuit = {"resistance": RESISTANCE, "turns": 1, "inductance": INDUCTANCE, "voltage": 1.0}
         magnets.add_coil("driven", shape="loop", radius=0.01, xform=aside, **circuit)
         magnets.add_magnetometer("hall", xform=((0.0, 0.0, HALL), (0.0, 0.0, 0.0, 1.0)))
         environment = Environment(cfg)

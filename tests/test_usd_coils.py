@@ -199,7 +199,7 @@ UNEVEN = "float3 xformOp:scale = (1, 2, 1)", 'uniform token[] xformOpOrder = ["x
     (coil("float warpmag:coil:radius = -1"), "/Thing: radius: must be positive"),
     (coil("float warpmag:coil:radius = 1", "float warpmag:coil:voltage = 1"), "/Thing: voltage is given, but only a"),
     (coil("float warpmag:coil:radius = 1", "float warpmag:coil:voltage.timeSamples = { 0: 0, 1: 1 }"), "/Thing: "),
-    (coil("float warpmag:coil:radius = 1", "float warpmag:coil:resistance = 1",
+    (coil("float warpmag:coil:radius = 1", "float warpmag:coil:resistance = 1", "float warpmag:coil:turns = 9",
           "float warpmag:coil:ampereTurns.timeSamples = { 0: 0, 1: 1 }"), "but follows from the voltage"),
     (coil("float warpmag:coil:radius = inf"), "/Thing: radius"),
     (coil("token warpmag:coil:radius = \"wide\""), "/Thing: warpmag:coil:radius: 'wide' is not a float"),

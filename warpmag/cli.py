@@ -164,9 +164,9 @@ def _check(options) -> int:
     print(f"bodies      {bodies} ({kinematic} kinematic), {colliders} colliders")
     print(f"magnets     {len(report.magnets('inducible'))} inducible, {len(report.magnets('permanent'))} permanent")
     sources = [source for group in contents.sources.values() for source in group]
-    currents = sum(source.drive is not None for source in sources)
-    if contents.motions or contents.magnetization_keys or contents.field_keys or currents:
-        more = f", {currents} currents" if currents else ""
+    coils = sum(source.drive is not None for source in sources)
+    if contents.motions or contents.magnetization_keys or contents.field_keys or coils:
+        more = f", {_counted(coils, 'coil')}" if coils else ""
         more += ", the external field" if contents.field_keys else ""
         print(f"keyed       {len(contents.motions)} bodies, {len(contents.magnetization_keys)} magnetizations{more}")
     if sources:

@@ -108,7 +108,7 @@ class SourceRecord:
             counts = tuple(int(count) for count in p[6:9])
             nodes = self.table.reshape(*(count + 2 for count in counts), 3)[1:-1, 1:-1, 1:-1]
             return FieldMap(p[:3], p[3:6], nodes, strength)
-        turns, resistance, inductance = self.circuit or (1.0, 0.0, 0.0)
+        turns, resistance, inductance = self.circuit or (0.0, 0.0, 0.0)
         driven = {"resistance": resistance, "voltage": voltage, "turns": turns, "inductance": inductance}
         shared = {"wire_radius": p[-1], "ampere_turns": strength, **driven}
         if self.kind == "polyline":
@@ -179,9 +179,9 @@ class Coil:
         unit="volt", range=f"[-{LARGEST_STRENGTH:g}, {LARGEST_STRENGTH:g}]", check=check_strength,
     )] = 0.0  # fmt: skip
     turns: Annotated[float, Attribute(
-        "coil:turns", "float", "Turns", "Number of turns of a coil with a resistance.",
+        "coil:turns", "float", "Turns", "Number of turns of a coil with a resistance, which must give it.",
         unit="dimensionless", range=_CIRCUIT_TEXT, check=check_circuit_value, uniform=True,
-    )] = 1.0  # fmt: skip
+    )] = 0.0  # fmt: skip
     inductance: Annotated[float, Attribute(
         "coil:inductance", "float", "Inductance",
         "Inductance in air of a coil with a resistance, as measured; 0 means that of its geometry.",
@@ -214,11 +214,11 @@ class Coil:
     def _check_circuit(self, name: str) -> None:
         check_fields(self, name, "resistance", "voltage", "turns", "inductance")
         if self.resistance == 0.0:
-            for field, default in (("voltage", 0.0), ("turns", 1.0), ("inductance", 0.0)):
-                if getattr(self, field) != default:
+            for field in ("voltage", "turns", "inductance"):
+                if getattr(self, field) != 0.0:
                     raise InputError(f"{name}: {field} is given, but only a coil with a resistance has one")
         elif self.turns == 0.0:
-            raise InputError(f"{name}: turns: must be positive, got 0")
+            raise InputError(f"{name}: turns is missing: a coil with a resistance needs their number")
         elif self.shape == "polyline" and not self.closed:
             raise InputError(f"{name}: resistance is given, but an open polyline is only a part of a circuit")
 

@@ -60,11 +60,8 @@ class CoilCircuits:
         """Return the arrays of the circuits, without those of worlds and inductances."""
         windings = [record.circuit for record in records]
         turns, a, count = np.array([winding.turns for winding in windings]), CircuitArrays(), len(circuits)
-        a.source, a.shape, a.turns = (
-            self._put(circuits, wp.int32),
-            self._put(self.shapes, wp.int32),
-            self._put(turns, wp.float64),
-        )
+        a.source, a.shape = (self._put(values, wp.int32) for values in (circuits, self.shapes))
+        a.turns = self._put(turns, wp.float64)
         a.resistance = self._put([winding.resistance for winding in windings] / turns**2, wp.float64)
         a.voltage, a.strength = self._attributes.voltage, self._attributes.strength
         a.flux, a.fresh = self._put(np.zeros(count), wp.float64), self._put(np.ones(count), wp.int32)
@@ -121,10 +118,15 @@ class _Inductances:
         self.shapes, self._records, self._applied = shapes, records, applied
         self._frames = model.shape_transform.numpy()[list(shapes)].astype(float)
         self._known: dict[tuple, float] = {}
+        self._given: dict[int, list[int]] = {}  # coils with given currents by world, -1 for all worlds
+        for k, record in enumerate(records):
+            if record.circuit is None:
+                self._given.setdefault(applied[k].world, []).append(k)
 
     def given(self, k: int) -> list[int]:
         """Return the coils with given currents in the world of source k that do not move relative to it."""
-        return [j for j, record in enumerate(self._records) if record.circuit is None and self._are_linked(k, j)]
+        worlds = -1, self._applied[k].world
+        return [j for world in worlds for j in self._given.get(world, []) if self._are_linked(k, j)]
 
     def between(self, k: int, j: int) -> float:
         """Return the inductance of one turn of source k to one of source j; 0 if they move relative to each other."""
@@ -143,12 +145,9 @@ class _Inductances:
         return self._once(key, lambda: mutual_inductance(record, other, rotation, offset))
 
     def _are_linked(self, k: int, j: int) -> bool:
+        """Return True for coils of one world that do not move relative to each other."""
         source, other = self._applied[k], self._applied[j]
-        return (
-            SourceKind.FIELD_MAP not in (source.kind, other.kind)
-            and source.body == other.body
-            and other.world in (-1, source.world)
-        )
+        return SourceKind.FIELD_MAP not in (source.kind, other.kind) and source.body == other.body
 
     def _once(self, key: tuple, value) -> float:
         if key not in self._known:

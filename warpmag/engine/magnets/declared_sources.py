@@ -38,7 +38,7 @@ def add_coil(
     ampere_turns: float = 0.0,
     resistance: float = 0.0,
     voltage: float = 0.0,
-    turns: float = 1.0,
+    turns: float = 0.0,
     inductance: float = 0.0,
     xform: wp.transform | tuple | None = None,
     label: str | None = None,
@@ -65,7 +65,7 @@ def add_coil(
             flux of iron, magnets and coils. By default the current is given.
         voltage: Voltage [V] at a coil with a resistance; :meth:`warpmag.Magnetics.set_voltage` changes it. 0 is a
             short circuit.
-        turns: Number of turns of a coil with a resistance.
+        turns: Number of turns; a coil with a resistance needs it.
         inductance: Inductance of a coil with a resistance, in air [H]. By default that of its geometry: all turns in
             the wire of a loop or a polyline, or in the sheet of a solenoid.
         xform: Pose of the coil in the frame of the body, or in the world.

@@ -44,9 +44,12 @@ class ModelSources:
         records: dict[str, SourceRecord] = {}
         for shape in [shape for shape, text in enumerate(texts) if text]:
             world = _world_of(model.shape_label[shape], int(worlds[shape]), bodies[shape] >= 0, magnet_worlds)
+            record = records.get(texts[shape]) or SourceRecord.from_text(texts[shape])
+            records[texts[shape]] = record
+            if world is None and record.circuit is not None:
+                raise InputError(f"{model.shape_label[shape]}: a coil with a voltage in a world without magnets")
             if world is None:
                 continue
-            record = records.setdefault(texts[shape], SourceRecord.from_text(texts[shape]))
             body = int(bodies[shape])
             movable = body >= 0 and not flags.numpy()[body] & KINEMATIC
             kind = SourceKind[record.kind.upper()]
