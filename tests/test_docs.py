@@ -27,7 +27,10 @@ MISSING = {name for name in ("torch", "isaaclab") if importlib.util.find_spec(na
 STAGE = re.compile(r"^```\n(#usda 1\.0\n# (\S+)\n.*?)^```$", re.MULTILINE | re.DOTALL)
 """A whole stage and the file to save it as."""
 COMMAND = re.compile(r"^(?:pip install uv && uv run )?(warpmag .*)$", re.MULTILINE)
-SLOW = ("physics.md", *(f"howto/{name}.md" for name in ("coils", "design", "gradients", "holding", "mujoco", "newton")))
+SLOW = (
+    "physics.md",
+    *(f"howto/{name}.md" for name in ("coils", "design", "energy", "gradients", "holding", "mujoco", "newton")),
+)
 """Pages that take long, most of them to compile kernels that no other test needs; ``.ci/run`` runs them, too."""
 
 
