@@ -180,3 +180,22 @@ def test_bad_names_and_shapes_are_refused(environment):
         magnets.add_coil("hall", shape="loop", radius=LOOP)
     with pytest.raises(InputError, match=r"^add_coil: radius: "):
         magnets.add_coil("other", shape="loop", radius=-1.0)
+
+
+WRONG = {
+    "set_current: env_ids": lambda magnets: magnets.set_current("coil", 1.0, [7]),
+    "set_current: must be a number": lambda magnets: magnets.set_current("coil", "1"),
+    "set_current: shape": lambda magnets: magnets.set_current("coil", torch.zeros(2)),
+    r"set_current: \[1\] is unknown": lambda magnets: magnets.set_current([1], 1.0),
+    "reset: env_ids": lambda magnets: magnets.reset("all"),
+    "readings: None is unknown": lambda magnets: magnets.readings(None),
+    "add_coil: name": lambda magnets: magnets.add_coil(3, radius=0.1, ampere_turns=1.0),
+    "add_coil: body": lambda magnets: magnets.add_coil("another", body=3, radius=0.1, ampere_turns=1.0),
+    "add_magnetometer: xform": lambda magnets: magnets.add_magnetometer("another", xform=(0.0, 0.0)),
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_wrong_arguments_are_one_line(message, environment):
+    with pytest.raises(InputError, match=f"^{message}[^\n]*$"):
+        WRONG[message](environment.magnets)

@@ -25,11 +25,11 @@ from isaaclab.sim import SimulationContext
 from isaaclab_newton.physics import NewtonBuilderCfg, NewtonCfg, NewtonManager
 
 from warpmag.declarations.attributes import NAMESPACE
-from warpmag.declarations.checks import short_repr
+from warpmag.declarations.checks import check_text, short_repr
 from warpmag.declarations.coils import SourceRecord
 from warpmag.engine.magnets.attributes import mark_shapes
 from warpmag.engine.magnets.declared_magnets import add_inducible, add_permanent
-from warpmag.engine.magnets.declared_sources import add_coil
+from warpmag.engine.magnets.declared_sources import add_coil, checked_frame
 from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.engine.magnets.magnetometer import SensorMagnetometer
 from warpmag.engine.magnets.usd_import import register_custom_attributes, shape_magnet
@@ -120,11 +120,14 @@ class Magnets:
         Raises:
             InputError: The name is used already.
         """
-        frame = wp.transform() if xform is None else wp.transform(*xform)
+        frame = wp.transform() if xform is None else checked_frame("add_magnetometer: xform", xform)
         self._sensors[name] = self._add_site("add_magnetometer", name, body, frame), options
 
     def _add_site(self, function: str, name: str, body: str | None, frame: wp.transform) -> str:
         """Register a site, which Isaac Lab clones with its body; return the end of its label."""
+        check_text(f"{function}: name", name)
+        if body is not None:
+            check_text(f"{function}: body", body)
         if name in self._coils or name in self._sensors:
             raise InputError(f"{function}: {short_repr(name)} exists already")
         if body is None:
@@ -155,8 +158,11 @@ class Magnets:
         rows = self._look_up(self._coil_shapes, function, coil)
         if (SourceRecord.from_text(self._coils[coil][1]["source"]).circuit is not None) != driven:
             raise InputError(f"{function}: {short_repr(coil)} has {'no resistance' if driven else 'a voltage'}")
-        rows = rows if env_ids is None else rows[env_ids]
-        values = torch.as_tensor(value, dtype=targets.dtype, device=targets.device)
+        rows = rows[self._environments(function, env_ids)]
+        try:
+            values = torch.as_tensor(value, dtype=targets.dtype, device=targets.device)
+        except Exception as error:  # PyTorch raises errors of several types
+            raise InputError(f"{function}: must be a number or a tensor, got {short_repr(value)}") from error
         values = values[:, None] if values.ndim == 1 else values
         if values.ndim and tuple(values.shape) not in (tuple(rows.shape), (len(rows), 1)):
             expected = f"[{len(rows)}] or {list(rows.shape)}"
@@ -187,7 +193,7 @@ class Magnets:
         if env_ids is not None:
             model = self.magnetics.model
             mask = torch.zeros(model.world_count, dtype=torch.bool, device=wp.device_to_torch(model.device))
-            mask[env_ids] = True
+            mask[self._environments("reset", env_ids)] = True
         self.magnetics.reset(mask)
 
     def update(self) -> None:
@@ -196,9 +202,21 @@ class Magnets:
         self.magnetics.induce(NewtonManager.get_state_0())
         self._measure()
 
+    def _environments(self, function: str, env_ids: Any) -> torch.Tensor:
+        """Return indices of environments, all if ``env_ids`` is None; wrong ones on the host raise an error."""
+        model = self.magnetics.model
+        all_ids = torch.arange(model.world_count, device=wp.device_to_torch(model.device))
+        if env_ids is None:
+            return all_ids
+        try:
+            chosen = all_ids[env_ids]
+        except Exception as error:  # PyTorch raises errors of several types
+            raise InputError(f"{function}: env_ids: no environments: {short_repr(env_ids)}") from error
+        return chosen[None] if chosen.ndim == 0 else chosen
+
     @staticmethod
     def _look_up(named: dict[str, Any], function: str, name: str) -> Any:
-        if name not in named:
+        if not isinstance(name, str) or name not in named:
             raise InputError(f"{function}: {short_repr(name)} is unknown, there are {', '.join(named) or 'none'}")
         return named[name]
 

@@ -164,7 +164,7 @@ def _add_source(
         check_whole("body", body)
     number = -1 if body == -1 else _single_body(builder, body)
     check_text("label", label)
-    frame = wp.transform() if xform is None else _checked_frame("xform", xform)
+    frame = wp.transform() if xform is None else checked_frame("xform", xform)
     values = {"source": source.record().to_text(), "current_keys": keys}
     if isinstance(source, Coil):
         values |= {"strength": float(source.ampere_turns), "voltage": float(source.voltage)}
@@ -182,7 +182,7 @@ def _single_body(builder: newton.ModelBuilder, body: int | str) -> int:
     return bodies[0]
 
 
-def _checked_frame(name: str, xform) -> wp.transform:
+def checked_frame(name: str, xform) -> wp.transform:
     """Return a transform from seven numbers, or from a position and a quaternion, which is normalized."""
     try:
         parts = list(plain_value(name, xform))
