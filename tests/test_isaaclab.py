@@ -185,6 +185,7 @@ def test_bad_names_and_shapes_are_refused(environment):
 WRONG = {
     "set_current: env_ids": lambda magnets: magnets.set_current("coil", 1.0, [7]),
     "set_current: must be a number": lambda magnets: magnets.set_current("coil", "1"),
+    "set_current: must be finite": lambda magnets: magnets.set_current("coil", torch.tensor([0.0, np.inf, 0.0])),
     "set_current: shape": lambda magnets: magnets.set_current("coil", torch.zeros(2)),
     r"set_current: \[1\] is unknown": lambda magnets: magnets.set_current([1], 1.0),
     "reset: env_ids": lambda magnets: magnets.reset("all"),

@@ -160,9 +160,13 @@ class Magnets:
             raise InputError(f"{function}: {short_repr(coil)} has {'no resistance' if driven else 'a voltage'}")
         rows = rows[self._environments(function, env_ids)]
         try:
-            values = torch.as_tensor(value, dtype=targets.dtype, device=targets.device)
+            values = torch.as_tensor(value)
+            finite = values.is_cuda or bool(torch.isfinite(values).all())  # values on a GPU are not read
+            values = values.to(dtype=targets.dtype, device=targets.device)
         except Exception as error:  # PyTorch raises errors of several types
             raise InputError(f"{function}: must be a number or a tensor, got {short_repr(value)}") from error
+        if not finite:
+            raise InputError(f"{function}: must be finite, got {short_repr(value)}")
         values = values[:, None] if values.ndim == 1 else values
         if values.ndim and tuple(values.shape) not in (tuple(rows.shape), (len(rows), 1)):
             expected = f"[{len(rows)}] or {list(rows.shape)}"
@@ -209,10 +213,11 @@ class Magnets:
         if env_ids is None:
             return all_ids
         try:
-            chosen = all_ids[env_ids]
+            chosen = torch.atleast_1d(all_ids[env_ids])
+            (_,) = chosen.shape
         except Exception as error:  # PyTorch raises errors of several types
             raise InputError(f"{function}: env_ids: no environments: {short_repr(env_ids)}") from error
-        return chosen[None] if chosen.ndim == 0 else chosen
+        return chosen
 
     @staticmethod
     def _look_up(named: dict[str, Any], function: str, name: str) -> Any:
