@@ -360,3 +360,10 @@ def test_a_wire_takes_few_test_points(kind, monkeypatch):
     assert body.volumes.sum() == pytest.approx(solid.volume, rel=1e-12)
     assert max(rays) <= 32**2
     np.testing.assert_allclose(body.positions[:, :2], 0.0, atol=1e-12)  # on the axis
+
+
+@pytest.mark.parametrize("solid", [lattice.cylinder(1e-4, 0.7), lattice.ellipsoid([1e-4, 1e-4, 0.3])])
+def test_spacing_of_a_wire_takes_long_steps_to_the_same_lattice(solid, monkeypatch):
+    filled = lattice.fill(solid, 0.0, 3, together=True)
+    monkeypatch.setattr(lattice, "_steps", lambda *_: 1)
+    np.testing.assert_array_equal(filled.positions, lattice.fill(solid, 0.0, 3, together=True).positions)

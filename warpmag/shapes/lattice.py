@@ -248,9 +248,19 @@ def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1,
     spacing = automatic
     lattice = _fill(parts, spacing, across, together)
     while len(lattice.volumes) > most:
-        spacing *= _STEP
+        spacing *= _STEP ** _steps(lattice, most)
         lattice = _fill(parts, spacing, across, together)
     return lattice
+
+
+def _steps(lattice: Lattice, most: int) -> int:
+    """Return a number of steps of the spacing of which none but the last can leave at most ``most`` moments.
+
+    The number of cells in a row, as in a wire, falls as the spacing grows. All else takes single steps.
+    """
+    if len(lattice.pieces) > 1 or np.count_nonzero(np.ptp(lattice.pieces[0].index, axis=0)) > 1:
+        return 1
+    return max(1, int(np.log(len(lattice.volumes) / most) / np.log(_STEP)) - 1)
 
 
 def _automatic_cells(parts: Sequence[Solid], across: int, most: int, together: bool) -> tuple[float, int]:
