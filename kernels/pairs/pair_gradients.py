@@ -34,6 +34,17 @@ _WARP, _LEAST_SHARED, _MOST_SHARED = 32, 256, 8192
 """Threads of a GPU that share a moment with at least this many sources, in systems of at most this many moments: so few
 moments occupy all processors, while more moments load the sources less often with smaller groups."""
 
+_FEWEST_EVALUATED = 512
+"""Fewest sources per moment for which a GPU computes gradients of fields faster as a field and two forces."""
+
+
+def one_sum_is_faster(device, pairs: float, count: int) -> bool:
+    """Return True if :class:`PairGradients` of fields is faster than a field and two forces (``pairs.evaluate``).
+
+    ``pairs`` counts pairs of two moments, ``count`` moments.
+    """
+    return device.is_cpu or pairs < _FEWEST_EVALUATED * count
+
 
 @cache
 def _arrays_type(dtype):

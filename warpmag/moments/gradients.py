@@ -16,7 +16,7 @@ from dataclasses import replace
 import warp as wp
 
 from warpmag.kernels.pairs.packing import PackedMoments
-from warpmag.kernels.pairs.pair_gradients import PairGradients
+from warpmag.kernels.pairs.pair_gradients import PairGradients, one_sum_is_faster
 from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.axpy import launch_add_scaled
@@ -57,7 +57,8 @@ def field_product(
         needed: Names of the gradients to compute.
         fmm_rtol: Relative error of the fast multipole method; None means sums over all pairs.
     """
-    if targets is None and "positions" in needed and fmm_rtol is None:
+    count, by_positions = moments.count, targets is None and "positions" in needed
+    if by_positions and fmm_rtol is None and one_sum_is_faster(moments.positions.device, count**2, count):
         return _mutual_product(moments, cotangents)
     acting = replace(moments if targets is None else targets, moments=cotangents)
     gradients = {}

@@ -35,8 +35,9 @@ from warpmag.kernels.induction.tangent import Tangent
 from warpmag.kernels.material.curves import CurveParameters
 from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
-from warpmag.kernels.pairs.pair_gradients import PairGradients
+from warpmag.kernels.pairs.pair_gradients import PairGradients, one_sum_is_faster
 from warpmag.kernels.pairs.pair_law import Quantity
+from warpmag.kernels.pairs.work_list import pair_count
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.axpy import launch_add_scaled
 from warpmag.moments.fmm import FastSums
@@ -105,11 +106,10 @@ class SystemGradients:
         self._tangent = Tangent(state, self._acting, self._field, material, rtol)
         self.cells = CellTurns(couplings, self._tangent.vectors, self._field) if couplings else None
         self._wrenches = PairGradients(self._bodies, ends, external_field=self.external_field)
-        self._fields = (
-            _MultipoleGradients(self._moments, self._acting, self._fast, ranges)
-            if self._fast
-            else PairGradients(self._moments, ends, cotangents=self._acting.moments)
-        )
+        if not self._fast and one_sum_is_faster(packed.device, pair_count(ranges[:, [0, 2, 0, 2]]), packed.count):
+            self._fields = PairGradients(self._moments, ends, cotangents=self._acting.moments)
+        else:
+            self._fields = _EvaluatedGradients(self._moments, self._acting, self._fast or (None, None), ranges)
         self.coils = CoilGradients(sources, self._bodies, worlds) if sources and sources.applied else None
         self.by_field = self._tangent.eta
         self.by_positions, self.by_moments = self._fields.by_positions, self._fields.by_moments
@@ -212,10 +212,11 @@ class SystemGradients:
             warn_caller(text, ConvergenceWarning)
 
 
-class _MultipoleGradients:
-    """Gradients of a function of the field of moments at each other, by multipoles, as ``PairGradients`` has them.
+class _EvaluatedGradients:
+    """Gradients of a function of the field of moments at each other, from a field and two forces.
 
-    ``acting`` are the cotangents as moments, ``fast`` the boxes of both, ``ranges`` those of ``SystemGradients``.
+    Attributes and methods are those of ``PairGradients``. ``acting`` are the cotangents as moments, ``fast`` the boxes
+    of both, or None for sums over all pairs, ``ranges`` those of ``SystemGradients``.
     """
 
     def __init__(self, moments, acting, fast, ranges):
@@ -228,7 +229,7 @@ class _MultipoleGradients:
         no_torque = wp.zeros(moments.count, dtype=int, device=device)
 
         def evaluation(quantity, sources, boxes, out, **more):
-            sums, ranks = boxes.sums(quantity), current_ranks()
+            sums, ranks = boxes and boxes.sums(quantity), current_ranks()
             return PairEvaluation(quantity, segments, sources, sources, zero, out, sums=sums, ranks=ranks, **more)
 
         arrays = {"with_torque": no_torque, "torques": torques}
