@@ -18,7 +18,6 @@ from bench.systems import moment_system, solve_cold
 from bench.timing import measure
 from warpmag.kernels.pairs.evaluate import PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
-from warpmag.kernels.pairs.pair_gradients import PairGradients
 from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.moments.system import MomentSystem
 
@@ -72,13 +71,10 @@ def run_calls(count: int, device) -> dict:
     forces, torques = _cotangents(system, 2)
     packed = PackedMoments(system.radii, largest_radius=RADIUS, moving=False)
     packed.pack(system.positions, system.moments)
-    acting = packed.twin()
-    acting.pack(system.positions, forces)
-    fields = PairGradients(packed, (0, count), cotangents=acting.moments)
     _load(system)
 
     def sum_cotangents():
-        acting.find_overlaps()
+        packed.find_overlaps()
         system.gradients.evaluate()
 
     gradients, rotatable = system.gradients, wp.ones(count, dtype=int, device=device)
@@ -89,7 +85,7 @@ def run_calls(count: int, device) -> dict:
     times = {
         "field": lambda: (packed.find_overlaps(), system.evaluate()),
         "field_by_moments": sum_cotangents,
-        "field_by_moments_and_positions": fields.launch,
+        "field_by_moments_and_positions": lambda: (packed.find_overlaps(), gradients.fields.launch()),
         "wrench": lambda: (packed.find_overlaps(), wrench.launch()),
         "wrench_gradient": lambda: gradients.wrench(forces, torques),
         "cold_solve": lambda: solve_cold(system),

@@ -70,6 +70,7 @@ class SystemGradients:
         h: State: field [A/m] in which M = f(H), shape [n].
         external_field: State: applied field [A/m], which exerts torques, shape [n].
         by_field: η, the gradient by the applied field in the solve [m/A], after :meth:`solve`, shape [n].
+        fields: Gradients of the field of all moments at each other, which :meth:`solve` launches.
         by_positions: Gradient by positions [1/m], after :meth:`solve`, shape [n].
         by_moments: Field T η, the gradient by permanent moments [1/(A·m²)], after :meth:`solve`, shape [n].
     """
@@ -107,12 +108,12 @@ class SystemGradients:
         self.cells = CellTurns(couplings, self._tangent.vectors, self._field) if couplings else None
         self._wrenches = PairGradients(self._bodies, ends, external_field=self.external_field)
         if not self._fast and one_sum_is_faster(packed.device, pair_count(ranges[:, [0, 2, 0, 2]]), packed.count):
-            self._fields = PairGradients(self._moments, ends, cotangents=self._acting.moments)
+            self.fields = PairGradients(self._moments, ends, cotangents=self._acting.moments)
         else:
-            self._fields = _EvaluatedGradients(self._moments, self._acting, self._fast or (None, None), ranges)
+            self.fields = _EvaluatedGradients(self._moments, self._acting, self._fast or (None, None), ranges)
         self.coils = CoilGradients(sources, self._bodies, worlds) if sources and sources.applied else None
         self.by_field = self._tangent.eta
-        self.by_positions, self.by_moments = self._fields.by_positions, self._fields.by_moments
+        self.by_positions, self.by_moments = self.fields.by_positions, self.fields.by_moments
 
     def load(self, positions, moments, h, external_field) -> None:
         """Set the state at which gradients are computed, arrays as the attributes of these names."""
@@ -172,7 +173,7 @@ class SystemGradients:
             self._iterate()  # no world can converge before its first evaluation
             wp.capture_while(tangent.condition, self._iterate)
         tangent.finish(None if by_field is None else self._given_field)
-        self._fields.launch()
+        self.fields.launch()
         if self.cells is not None:
             self.cells.turn(self.moments, self.by_field, self.by_moments)
         if self.coils is not None:
