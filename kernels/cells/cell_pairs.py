@@ -148,6 +148,16 @@ def _most_near(points: np.ndarray, reach: float) -> int:
     return int((distances <= reach).sum(axis=1).max())
 
 
+def _large_zeros(size: int, dtype, device) -> wp.array:
+    """Return zeros that take memory on a CPU only where they are written: most rows of many bodies never are."""
+    if device.is_cuda:
+        return wp.zeros(size, dtype=dtype, device=device)
+    line = 64  # bytes of a cache line
+    values = np.zeros(size + line, wp.dtype_to_numpy(dtype))
+    begin = -values.ctypes.data % line // values.itemsize
+    return wp.array(values[begin : begin + size], dtype=dtype, device=device, copy=False)
+
+
 class CellPairs:
     """Corrections between cells of different bodies, evaluated repeatedly in the same arrays.
 
@@ -203,8 +213,8 @@ class CellPairs:
         self.crowded = a.crowded = zeros(1)
         a.rows, a.bin, a.bin_end = zeros(1), zeros(n), zeros(_BINS)
         a.cell, a.hardness = zeros(padded), zeros(padded, kind=dtype)
-        a.pose = zeros(padded * capacity * _POSE_ROWS, kind=dtype)
-        a.tensor = zeros(padded * capacity * _TENSOR_ROWS, kind=dtype)
+        a.pose = _large_zeros(padded * capacity * _POSE_ROWS, dtype, device)
+        a.tensor = _large_zeros(padded * capacity * _TENSOR_ROWS, dtype, device)
         self._locate, self._tabulate = self._record(LOCATE, LOCATE), self._record(CLEAR, TABULATE)
         self._field, self._force = self._record(ADD_FIELD, ADD_FIELD), self._record(ADD_FORCE, ADD_FORCE)
 
