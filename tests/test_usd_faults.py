@@ -89,6 +89,17 @@ REFUSED = {
     "magnet as large as a country": (ball(radius="double radius = 1e5"), "/Ball: radius 100000 scaled by 1 to 1 must"),
     "too fast": (ball("vector3f physics:velocity = (1e30, 0, 0)"), "/Ball: physics:velocity must be from"),
     "negative margin": (ball("float newton:contactMargin = -1"), "/Ball: newton:contactMargin must be from 0"),
+    "double for float": (ball("double physics:mass = 2"), "/Ball: physics:mass must be of type float, not double"),
+    "float for double": (ball(radius="float radius = 0.005"), "/Ball: radius must be of type double, not float"),
+    "half for float": (
+        ball() + 'def Material "Rubber" (prepend apiSchemas = ["PhysicsMaterialAPI"])\n'
+        "{\nhalf physics:restitution = 0.5\n}",
+        "/Rubber: physics:restitution must be of type float, not half",
+    ),
+    "double gravity": (
+        ball() + 'def PhysicsScene "Scene"\n{\ndouble physics:gravityMagnitude = 5\n}',
+        "/Scene: physics:gravityMagnitude must be of type float, not double",
+    ),
     "NaN gap": (ball("float newton:contactGap = nan"), "/Ball: newton:contactGap must be finite"),
     "friction of a material": (
         ball() + 'def Material "Rubber" (prepend apiSchemas = ["PhysicsMaterialAPI"])\n'
@@ -168,6 +179,7 @@ SOUND = {
     "inverted operation": posed(
         ["xformOp:translate", "!invert!xformOp:translate"], "double3 xformOp:translate = (1, 2, 3)"
     ),
+    "types of other roles": ball("float3 physics:velocity = (0, 0, 1)", "float3 physics:centerOfMass = (0, 0, 0)"),
     "notes of somebody": ball('custom float note = nan\ncustom string other = "x"'),
     "empty mesh to look at": ball() + 'def Mesh "Decoration"\n{\npoint3f[] points = []\n}',
 }

@@ -25,6 +25,7 @@ from pathlib import Path
 
 from . import damage
 from .mutate import mutate
+from .sources import DRAWN
 from .truth import differences
 
 FORMS = ("usda",) * 13 + ("text",) * 3 + ("crate",) * 3 + ("package",)
@@ -116,12 +117,12 @@ def warm_up(stages: list[Path], command: Callable, together: int = 1) -> None:
     """Run sound stages: in fresh processes to have their kernels compiled, in this one to have them loaded.
 
     Fresh ones have no limits, and may run ``together``. Else all workers would compile the same kernels at first, and
-    be killed for it. The first stage is drawn, too.
+    be killed for it. The stage :data:`sources.DRAWN` is drawn, too.
     """
 
     def run(stage):
         commands = [("run", str(stage), "--frames", "1", "--device", "cpu", "-o", f"{folder}/{stage.stem}.out.usda")]
-        if stage is stages[0]:
+        if stage.name == DRAWN:
             commands.append(("render", str(stage), "-o", f"{folder}/out.png", *_SMALL, "cpu"))
         for arguments in commands:
             code, _, said = command(*arguments)

@@ -1,5 +1,6 @@
 """The stages that are spoiled: the bundled scenes, small, and three as somebody else would author them."""
 
+import random
 import shutil
 from pathlib import Path
 
@@ -7,6 +8,10 @@ from pxr import Sdf
 
 from warpmag.scenes_usd import balls_up, crystal_balls, falling_magnet, sakura_tree
 
+from .hostile import texture
+
+DRAWN = "drawn.usda"
+"""Name of the stage with a texture, which is also drawn."""
 STRANGE = [Path(__file__).with_name(name) for name in ("workshop.usda", "laboratory.usda", "studio.usda")]
 
 
@@ -29,12 +34,14 @@ def author(folder: Path) -> list[Path]:
 def author_others(folder: Path) -> list[Path]:
     """Write sound stages that need kernels which only mutants need else; return their files."""
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / name for name in ("multipole.usda", "box.usda")]
+    paths = [folder / name for name in ("multipole.usda", "box.usda", DRAWN)]
     for path in paths:
         balls_up.author(path, columns=2, rows=1, layers=1, conductivity=0.0)  # which only balls have
         layer = Sdf.Layer.FindOrOpen(str(path))
         if path.stem == "box":
             layer.GetPrimAtPath("/World/Balls/Ball_0000").typeName = "Cube"
+        elif path.name == DRAWN:
+            texture(layer, [Sdf.Path("/World/Balls/Ball_0000")], random.Random(0))
         else:
             layer.GetAttributeAtPath("/World/PhysicsScene.warpmag:contactModel").default = "multipole"
         layer.Save()

@@ -90,7 +90,8 @@ class Reading:
         kind, scales = prim.GetTypeName(), np.linalg.norm(matrix, axis=1)
         if kind in ("Capsule", "Cone", "Cylinder", "Sphere") and np.ptp(scales) > 1e-4 * scales.max():
             return None
-        size, radius, height = (np.float64(self.get(prim, name, 0.0)) for name in ("size", "radius", "height"))
+        sizes = [self.get(prim, name, 0.0) for name in ("size", "radius", "height")]
+        size, radius, height = (np.float64(value if isinstance(value, float) else 0.0) for value in sizes)
         with np.errstate(over="ignore", invalid="ignore"):  # sizes that are not this kind's
             local = {
                 "Sphere": 4.0 / 3.0 * math.pi * radius**3,

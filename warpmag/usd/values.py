@@ -54,6 +54,8 @@ _SHAPES = {
     "Plane": ("width", "length", "axis"),
     "Mesh": ("points", "faceVertexCounts", "faceVertexIndices", "orientation", "subdivisionScheme", "holeIndices"),
 }
+_LENGTHS = ("radius", "radiusTop", "radiusBottom", "height", "size", "width", "length")
+"""Sizes of shapes, numbers of double precision."""
 _VECTORS = (Gf.Vec3f, Gf.Vec3d, Gf.Vec3h, Gf.Vec3i)
 _NEED_SCHEMA = (
     *("physics:mass", "physics:density", "physics:centerOfMass", "physics:diagonalInertia", "physics:principalAxes"),
@@ -129,6 +131,8 @@ def value_of(prim: Usd.Prim, name: str):
     if value is None or not attribute.HasAuthoredValue():
         return value
     check_type(prim, name, value, declared(attribute) if fallback is None else fallback)
+    if name.startswith("physics:") or name in _LENGTHS:
+        _check_precision(prim, attribute)
     if name in _TOKENS and value not in _TOKENS[name]:
         raise InputError(f"{prim.GetPath()}: {name} must be one of {', '.join(_TOKENS[name])}, got {_shown(value)}")
     _check_numbers(prim, name, value, fallback)
@@ -276,6 +280,18 @@ def _defaults(schema: str) -> dict[str, object]:
     definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(schema)
     names = definition.GetPropertyNames() if definition else ()
     return {name: definition.GetAttributeFallbackValue(name) for name in names}
+
+
+def _check_precision(prim: Usd.Prim, attribute: Usd.Attribute) -> None:
+    """Raise :class:`InputError` if a number has another type than the schema's, such as double for float.
+
+    USD's physics parser reads such a friction, restitution, density, gravity or radius as 0 or as the default. Types
+    of other roles, such as float3 for point3f, are read.
+    """
+    usual = attribute.GetTypeName()  # the schema's, where it is applied
+    for spec in attribute.GetPropertyStack():
+        if spec.HasInfo("default") and spec.typeName.type != usual.type:
+            raise InputError(f"{prim.GetPath()}: {attribute.GetName()} must be of type {usual}, not {spec.typeName}")
 
 
 def _check_numbers(prim, name, value, fallback) -> None:
