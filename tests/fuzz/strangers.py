@@ -123,7 +123,7 @@ def crowd(layer, prims, chance) -> str:
                 one.specifier, one.typeName = Sdf.SpecifierDef, chance.choice(("Xform", "Sphere", "Scope"))
         return f"{count} prims more"
     if kind == 1:
-        for number in range(chance.choice((30, 100))):
+        for number in range(chance.choice((10, 30))):  # a hundred bodies of 250 moments take minutes, and rightly
             Sdf.CopySpec(layer, prim.path, layer, Sdf.Path(f"/Copy{number}"))
         return f"{number + 1} copies of {prim.path}"
     if kind == 2:
