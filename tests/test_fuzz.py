@@ -94,10 +94,12 @@ def test_a_campaign_survives_its_workers(batch, workers, tmp_path, monkeypatch):
 
     monkeypatch.setattr(campaign, "judge", judge_or_die)
     monkeypatch.setattr(campaign, "WALL_SECONDS", 1.0)
-    found = {one.number: one for one in Campaign(5, tmp_path, [], batch, workers).verdicts(range(20))}
-    assert sorted(found) == list(range(20))
-    problems = {number: " ".join(one.problems) for number, one in found.items() if one.problems}
+    verdicts = {verdict.number: verdict for verdict in Campaign(5, tmp_path, [], batch, workers).verdicts(range(20))}
+    assert sorted(verdicts) == list(range(20))
+    problems = {number: " ".join(verdict.problems) for number, verdict in verdicts.items() if verdict.problems}
     assert problems.keys() == {3, 7, 11, 13}
     assert problems[3] == "died of SIGKILL" and problems[7] == "hung for 1.0 s" and "ValueError" in problems[11]
-    assert {one.done for one in found.values() if not one.problems} == {f"5-{n}" for n in {*range(20)} - {3, 7, 11, 13}}
+    assert {verdict.done for verdict in verdicts.values() if not verdict.problems} == {
+        f"5-{n}" for n in {*range(20)} - {3, 7, 11, 13}
+    }
     assert sorted(path.name for path in tmp_path.iterdir()) == ["00003", "00007", "00011", "00013"]

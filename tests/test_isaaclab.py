@@ -138,7 +138,7 @@ def test_forces_act_in_every_substep(environment):
 
 
 def test_currents_follow_from_voltages(environment):
-    """Of each environment, in every substep; a reset returns to the voltage of the declaration."""
+    """Each environment has its own voltage in every substep; a reset restores the declared one."""
     magnets, steps = environment.magnets, 3
     environment.reset()
     magnets.reset()

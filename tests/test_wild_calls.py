@@ -42,7 +42,7 @@ def test_a_crash_is_seen(monkeypatch):
         return calls.Outcome(number, f"call {number}", taken=True)
 
     monkeypatch.setattr(calls.Caller, "call", call)
-    results = {one.number: one for one in calls.outcomes("wrench", 0, list(range(4)))}
+    results = {outcome.number: outcome for outcome in calls.outcomes("wrench", 0, list(range(4)))}
     assert sorted(results) == [0, 1, 2, 3]
     assert results[2].call == "call 2" and results[2].problem == f"its process ended with the status {signal.SIGKILL:d}"
     assert not any(results[number].problem for number in (0, 1, 3))

@@ -18,5 +18,5 @@ def _kernel(dtype):
 
 
 def launch_add_scaled(values, total, factor: float = 1.0):
-    """Add ``factor`` times an array to another array of the same type, either of which may be strided."""
+    """Add ``factor`` times an array to another array of the same type. Both may be strided."""
     wp.launch(_kernel(total.dtype), len(total), inputs=[factor, values], outputs=[total], device=total.device)

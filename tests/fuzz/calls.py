@@ -6,7 +6,8 @@
 Each call has one to three wild arguments among right ones: numbers, texts, arrays of other sizes, types and memory,
 states and models of other worlds. It must end in an ``InputError`` of one line or in finite results. The calls run in
 child processes, so that a crash counts; it ends the child, and the next one goes on behind the call that did it.
-Simulations and displays take long to make: a child keeps them as long as calls are refused.
+Simulations and displays take seconds to build. A child process builds them again only after a call that was not
+refused.
 ``warpmag.torch`` and ``warpmag.jax`` are called where their libraries are installed.
 """
 

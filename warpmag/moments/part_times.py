@@ -10,7 +10,7 @@ import warp as wp
 from warpmag.moments.system import MomentSystem
 
 _REPEATS, _LAUNCHES = 7, 10
-"""Measurements of a part, of which the median counts, and launches in a measurement."""
+"""Measurements of a part, whose median is the result, and launches in each measurement."""
 
 
 def part_times(system: MomentSystem) -> dict[str, float]:
