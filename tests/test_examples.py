@@ -30,7 +30,7 @@ def make(name, device, options):
     """An example that draws nothing, and its options."""
     with wp.ScopedDevice(device):
         module = importlib.import_module(f"warpmag.examples.{name}")
-        options = module.Example.create_parser().parse_args([*options.split(), "--test"])
+        options = module.Example.create_parser().parse_args([*options.split(), "--describe"])
         return module.Example(newton.viewer.ViewerNull(num_frames=options.num_frames), options), options
 
 
@@ -38,8 +38,10 @@ def run(name, device, options, capsys):
     example, options = make(name, device, options)
     with wp.ScopedDevice(device):
         examples.run(example, options)
-    (line,) = capsys.readouterr().out.splitlines()
-    assert line == example.summary()
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == examples.get_examples()[name]
+    assert any(line.startswith("Check ") for line in lines)  # the docstring of ``test_final``
+    assert lines[-1] == f"Passed: {example.summary()}"
 
 
 @pytest.mark.parametrize("name", examples.get_examples())

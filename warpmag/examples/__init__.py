@@ -2,12 +2,13 @@
 
 Each is a module with a class ``Example``: the constructor builds the scene, ``step`` advances one frame, ``render``
 shows it, ``test_final`` compares the result with physics, ``summary`` returns a line about it. ``--test`` calls
-``test_final`` at the end, ``--headless`` draws nothing. May import ``show``.
+``test_final`` at the end, ``--describe`` also prints the comparison, ``--headless`` draws nothing. May import ``show``.
 """
 
 import argparse
 import ast
 import importlib
+import inspect
 import sys
 from pathlib import Path
 
@@ -32,6 +33,7 @@ def create_parser(frames: int) -> argparse.ArgumentParser:
     for action in parser._actions:
         if action.dest == "headless":
             action.help = "Draw nothing, as --viewer null."
+    parser.add_argument("--describe", action="store_true", help="Print what the example shows and checks; as --test.")
     return parser
 
 
@@ -59,11 +61,22 @@ def init(parser: argparse.ArgumentParser):
 def run(example, options) -> None:
     """Run an example to its end and print its summary.
 
+    With ``--describe`` also print its description and its check.
+
     Raises:
-        AssertionError: With ``--test``, the result does not agree with physics.
+        AssertionError: With ``--test`` or ``--describe``, the result does not agree with physics.
     """
+    if options.describe:
+        options.test = True
+        print(_paragraph(sys.modules[type(example).__module__]), "\n")
+        print(_paragraph(type(example).test_final), flush=True)
     newton.examples.run(example, options)
-    print(example.summary())
+    print(f"Passed: {example.summary()}" if options.describe else example.summary())
+
+
+def _paragraph(item) -> str:
+    """Return the docstring of a module or a function, without the line of its command."""
+    return (inspect.getdoc(item) or "").partition("\n\nRuns: ")[0].strip()
 
 
 def get_examples() -> dict[str, str]:
@@ -97,7 +110,7 @@ def main() -> int:
     if name not in (None, "-h", "--help", "--list"):
         print(f"warpmag: {name}: no such example, there are {', '.join(examples)}", file=sys.stderr)
         return 2
-    print("python -m warpmag.examples NAME [--headless] [--test] [--viewer gl|viser|rerun|usd|null] [--device cuda:0]")
+    print("python -m warpmag.examples NAME [--describe] [--headless] [--test] [--viewer gl|viser|rerun|usd|null] [--device cuda:0]")
     width = max(map(len, examples))
     for example, line in examples.items():
         print(f"  {example:{width}}  {line}")

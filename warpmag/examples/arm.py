@@ -2,6 +2,8 @@
 
 Two links turn about vertical axes, and a slide carries the coil. The slide carries the whole weight of a held ball,
 since the forces of coil and ball on each other are opposite.
+
+Runs: ``python -m warpmag.examples arm``
 """
 
 import math
@@ -56,7 +58,8 @@ class Example:
         self.state_0, self.state_1, self.control = self.model.state(), self.model.state(), self.model.control()
         newton.eval_fk(self.model, self.model.joint_q, self.model.joint_qd, self.state_0)
         self.display = warpmag.Display(viewer, self.model, self.magnetics)
-        self.viewer, self.time, self.loads, self.graph = viewer, 0.0, [], None
+        self.frame_dt, self.sim_time = 0.012, 0.0  # s
+        self.viewer, self.loads, self.graph = viewer, [], None
         self.targets = self.control.joint_target_q.numpy()
         self.magnetics.set_current("gripper", 0.0)
         if on_gpu:
@@ -107,22 +110,22 @@ class Example:
     def step(self):
         """Advance by a frame of 12 ms."""
         start, end = joints_at(*START), joints_at(*END)
-        height = np.interp(self.time, TIMES, (0.0, 0.0, LIFT, LIFT, 0.0, 0.0))
-        fraction = 0.5 - 0.5 * math.cos(math.pi * np.interp(self.time, TIMES, (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)))
+        height = np.interp(self.sim_time, TIMES, (0.0, 0.0, LIFT, LIFT, 0.0, 0.0))
+        fraction = 0.5 - 0.5 * math.cos(math.pi * np.interp(self.sim_time, TIMES, (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)))
         self.targets[:3] = *((1.0 - fraction) * np.array(start) + fraction * np.array(end)), height
         self.control.joint_target_q.assign(self.targets)
-        self.magnetics.set_current("gripper", AMPERE_TURNS if 0.2 <= self.time < TIMES[-1] else 0.0)
+        self.magnetics.set_current("gripper", AMPERE_TURNS if 0.2 <= self.sim_time < TIMES[-1] else 0.0)
         if self.graph:
             wp.capture_launch(self.graph)
         else:
             self.simulate()
-        self.time += 0.012
+        self.sim_time += self.frame_dt
         load = STIFFNESS * (height - self.state_0.joint_q.numpy()[2])
-        self.loads.append((self.time, load, self.ball_position()[2]))
+        self.loads.append((self.sim_time, load, self.ball_position()[2]))
 
     def render(self):
         """Show the arm and the ball."""
-        self.display.show(self.time, self.state_0)
+        self.display.show(self.sim_time, self.state_0)
 
     def ball_position(self) -> np.ndarray:
         """Return the position of the ball [m]."""

@@ -2,6 +2,8 @@
 
 Kim and Han 2022, Fig. 3; ``warpmag run balls_up`` reads the same scene from a stage. There is no friction, so only
 impacts dissipate energy.
+
+Runs: ``python -m warpmag.examples balls_up``
 """
 
 import newton
@@ -37,6 +39,7 @@ class Example:
 
         self.simulation = warpmag.Simulation(builder, dt=1e-3)
         self.display = warpmag.Display(viewer, self.simulation.model, self.simulation.magnetics)
+        self.sim_time = 0.0
         self.viewer = viewer
         self.energies = [self.energy()]
 
@@ -52,11 +55,12 @@ class Example:
         """Advance by a frame of 20 ms."""
         for _ in range(20):
             self.simulation.step()
+        self.sim_time = self.simulation.time
         self.energies.append(self.energy())
 
     def render(self):
         """Show the balls."""
-        self.display.show(self.simulation.time, self.simulation.state)
+        self.display.show(self.sim_time, self.simulation.state)
 
     def energy(self) -> float:
         """Return the magnetic, kinetic and potential energy of all balls [J]."""

@@ -1,6 +1,8 @@
 """A bar magnet on a rotating arm drags a chain of magnetic balls over a table.
 
 Only magnetism holds the chain together. The motor works against the friction under the balls.
+
+Runs: ``python -m warpmag.examples chain``
 """
 
 import newton
@@ -42,6 +44,7 @@ class Example:
 
         self.simulation = warpmag.Simulation(builder, dt=1e-3)
         self.display = warpmag.Display(viewer, self.simulation.model, self.simulation.magnetics)
+        self.sim_time = 0.0
         self.viewer = viewer
         self.torques = []
 
@@ -56,12 +59,13 @@ class Example:
         """Advance by a frame of 20 ms."""
         for _ in range(20):
             self.simulation.step()
+        self.sim_time = self.simulation.time
         speed = self.simulation.state.body_qd.numpy()[0, 5]
         self.torques.append((GAIN * (SPEED - speed), self.friction_torque()))
 
     def render(self):
         """Show the chain."""
-        self.display.show(self.simulation.time, self.simulation.state)
+        self.display.show(self.sim_time, self.simulation.state)
 
     def friction_torque(self) -> float:
         """Return the torque of Coulomb friction, opposite to slip velocities, under all balls about the axis [N·m]."""

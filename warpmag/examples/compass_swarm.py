@@ -3,6 +3,8 @@
 The torques of field and oil balance: c dα/dt = μ0 m H sin(ωt - α). A needle lags by the angle arcsin(ω/ωc) as long as
 ω < ωc = μ0 m H/c. In faster fields it slips, with a mean speed of ω - √(ω² - ωc²) (Adler's equation). Each row of the
 swarm has one H, which grows from row to row.
+
+Runs: ``python -m warpmag.examples compass_swarm``
 """
 
 import math
@@ -50,6 +52,7 @@ class Example:
         self.simulation = warpmag.Simulation(builder, dt=5e-4)
         self.magnetics = self.simulation.magnetics
         self.display = warpmag.Display(viewer, self.simulation.model, self.magnetics)
+        self.sim_time = 0.0
         self.viewer = viewer
         self.angles = [self.angle()]
 
@@ -63,7 +66,7 @@ class Example:
 
     def field_angle(self) -> float:
         """Return the angle of the field [rad]."""
-        return SPEED * self.simulation.time
+        return SPEED * self.sim_time
 
     def step(self):
         """Advance by a frame of 5 ms."""
@@ -72,11 +75,12 @@ class Example:
             direction = np.array((math.cos(angle), math.sin(angle), 0.0))
             self.magnetics.set_external_field(self.fields[:, None] * direction)
             self.simulation.step()
+            self.sim_time = self.simulation.time
         self.angles.append(self.angle())
 
     def render(self):
         """Show the needles."""
-        self.display.show(self.simulation.time, self.simulation.state)
+        self.display.show(self.sim_time, self.simulation.state)
 
     def angle(self) -> np.ndarray:
         """Return the angle of each needle [rad], modulo 2π, shape [rows, columns]."""
@@ -85,7 +89,7 @@ class Example:
 
     def lags_and_speeds(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the final lag behind the field [rad] and mean speed [rad/s] of the first needle of each row."""
-        times = np.linspace(0.0, self.simulation.time, len(self.angles))
+        times = np.linspace(0.0, self.sim_time, len(self.angles))
         lags = np.unwrap(SPEED * times[:, None] - np.array(self.angles)[:, :, 0], axis=0)
         slips = []
         for lag in lags.T:

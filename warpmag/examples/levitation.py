@@ -3,6 +3,8 @@
 The sensor below the coil reads the field of the coil and that of the ball, which the coil magnetizes. The controller
 subtracts the coil's part by the measured current. The rest over the current is a measure of the gap. The current
 follows the voltage with the delay of the coil.
+
+Runs: ``python -m warpmag.examples levitation``
 """
 
 import math
@@ -62,6 +64,7 @@ class Example:
         self.own_signal = 4e-7 * math.pi * axial_field(COIL_HEIGHT - SENSOR)  # T/A, of the coil
         self.target_signal = 8e-7 * math.pi * RADIUS**3 * axial_field(COIL_HEIGHT - TARGET) / (SENSOR - TARGET) ** 3
         self.current, self.error, self.slope = holding_current(TARGET), 0.0, 0.0
+        self.sim_time = 0.0
         self.display, self.viewer = warpmag.Display(viewer, model, magnetics), viewer
 
     @staticmethod
@@ -92,10 +95,11 @@ class Example:
         for _ in range(10):
             self.simulation.magnetics.set_voltage("coil", self.voltage())
             self.simulation.step()
+        self.sim_time = self.simulation.time
 
     def render(self):
         """Show the ball."""
-        self.display.show(self.simulation.time, self.simulation.state)
+        self.display.show(self.sim_time, self.simulation.state)
 
     def height(self) -> float:
         """Return the height of the ball's center [m]."""

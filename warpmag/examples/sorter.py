@@ -2,6 +2,8 @@
 
 Brass balls stay in place. A coil lifts a steel ball if its current exceeds a threshold, here 1,180 ampere-turns. The
 example ``worlds`` has a closed form of the threshold.
+
+Runs: ``python -m warpmag.examples sorter``
 """
 
 import newton
@@ -47,6 +49,7 @@ class Example:
         self.simulation = warpmag.Simulation(builder, dt=1e-3)
         self.coils = args.coils
         self.display = warpmag.Display(viewer, self.simulation.model, self.simulation.magnetics)
+        self.sim_time = 0.0
         self.viewer, self.start = viewer, self.positions()
 
     @staticmethod
@@ -59,15 +62,16 @@ class Example:
 
     def step(self):
         """Advance by a frame of 20 ms."""
-        active = int(self.simulation.time / HOLD)
+        active = int(self.sim_time / HOLD)
         for coil in range(self.coils):
             self.simulation.magnetics.set_current(f"coil{coil}", AMPERE_TURNS if coil == active else 0.0)
         for _ in range(20):
             self.simulation.step()
+        self.sim_time = self.simulation.time
 
     def render(self):
         """Show the balls."""
-        self.display.show(self.simulation.time, self.simulation.state)
+        self.display.show(self.sim_time, self.simulation.state)
 
     def positions(self) -> np.ndarray:
         """Return the positions of the balls [m], shape [balls, 3]."""

@@ -2,6 +2,8 @@
 
 The force on an iron ball of volume V on the axis of a solenoid is 3 μ0 V H dH/dz. It exceeds the weight above a
 threshold current, and the worlds bracket this current in one run.
+
+Runs: ``python -m warpmag.examples worlds``
 """
 
 import math
@@ -54,6 +56,7 @@ class Example:
         self.currents = lifting_current() * np.linspace(0.9, 1.1, args.world_count)
         self.simulation.magnetics.set_current("coil", self.currents)
         self.display = warpmag.Display(viewer, self.simulation.model, self.simulation.magnetics)
+        self.sim_time = 0.0
         self.viewer = viewer
 
     @staticmethod
@@ -67,10 +70,11 @@ class Example:
         """Advance by a frame of 20 ms."""
         for _ in range(20):
             self.simulation.step()
+        self.sim_time = self.simulation.time
 
     def render(self):
         """Show all worlds side by side."""
-        self.display.show(self.simulation.time, self.simulation.state)
+        self.display.show(self.sim_time, self.simulation.state)
 
     def lifted(self) -> np.ndarray:
         """Return True for each world whose ball hangs at the plate, shape [worlds]."""
