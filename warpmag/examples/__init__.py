@@ -110,7 +110,7 @@ def main() -> int:
     if name not in (None, "-h", "--help", "--list"):
         print(f"warpmag: {name}: no such example, there are {', '.join(examples)}", file=sys.stderr)
         return 2
-    print("python -m warpmag.examples NAME [--describe] [--headless] [--viewer gl|viser|rerun|usd|null] [--device cuda:0]")
+    print("python -m warpmag.examples NAME [--describe] [--headless] [--viewer gl|viser|usd|null] [--device cuda:0]")
     width = max(map(len, examples))
     for example, line in examples.items():
         print(f"  {example:{width}}  {line}")
