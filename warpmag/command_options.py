@@ -156,7 +156,7 @@ def _add_run(run: argparse.ArgumentParser) -> None:
 def _add_render(render: argparse.ArgumentParser) -> None:
     add = render.add_argument
     add("stage", metavar="STAGE", help=_STAGE)
-    add("-o", "--output", metavar="FILE", required=True, help="picture (.png) or film (.mp4, .gif)")
+    add("-o", "--output", metavar="FILE", required=True, help="picture (.png) or film (.mp4, .webp, .gif)")
     frames = render.add_mutually_exclusive_group()
     text = "number of the frame to draw, 0 for the start (default: the last)"
     frames.add_argument("--frame", type=int, metavar="N", help=text)

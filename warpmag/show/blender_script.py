@@ -19,6 +19,17 @@ def draw(stage: str, output: str, frame: int, samples: int, width: int, height: 
     """
     import bpy  # noqa: PLC0415  # pyright: ignore[reportMissingImports] - Blender as a module
 
+    if not prepare(bpy, stage, frame, samples, width, height):
+        return "the stage has no camera"
+    render = bpy.context.scene.render
+    render.filepath = output
+    render.image_settings.file_format = "JPEG" if output.endswith((".jpg", ".jpeg")) else "PNG"
+    bpy.ops.render.render(write_still=True)
+    return ""
+
+
+def prepare(bpy, stage: str, frame: int, samples: int, width: int, height: int) -> bool:
+    """Open a stage for renderers and frame its bodies at a time code; return False if the stage has no camera."""
     bpy.ops.wm.read_factory_settings()
     for item in list(bpy.data.objects):
         bpy.data.objects.remove(item)
@@ -27,7 +38,7 @@ def draw(stage: str, output: str, frame: int, samples: int, width: int, height: 
     scene = bpy.context.scene
     cameras = [item for item in bpy.data.objects if item.type == "CAMERA"]
     if not cameras:
-        return "the stage has no camera"
+        return False
     scene.camera = cameras[0]
     scene.frame_set(frame)
     _frame_bodies(bpy, scene.camera, width / height)
@@ -36,10 +47,7 @@ def draw(stage: str, output: str, frame: int, samples: int, width: int, height: 
     scene.cycles.samples, scene.cycles.use_denoising = samples, True
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = width, height, 100
     scene.render.use_motion_blur = False
-    scene.render.filepath = output
-    scene.render.image_settings.file_format = "JPEG" if output.endswith((".jpg", ".jpeg")) else "PNG"
-    bpy.ops.render.render(write_still=True)
-    return ""
+    return True
 
 
 def _paint_curves(bpy) -> None:

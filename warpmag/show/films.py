@@ -10,16 +10,18 @@ from PIL import Image
 
 from warpmag.errors import InputError, extra
 
-FILMS = (".mp4", ".gif")
+FILMS = (".mp4", ".webp", ".gif")
 SUFFIXES = (".png", *FILMS)
-_GIF_RATE = 25.0
-"""Largest rate of a GIF [Hz]: players slow down faster GIFs."""
+_LOOP_RATE = 25.0
+"""Largest rate of a GIF or WebP [Hz]: players slow down faster GIFs."""
+_WEBP = {"quality": 70, "method": 6}
+"""Quality, at most 100, and effort of compression, at most 6."""
 
 
 def check_name(output: Path) -> None:
     """Raise :class:`InputError` unless the suffix names a format whose writer is installed."""
     if output.suffix.lower() not in SUFFIXES:
-        raise InputError(f"{output}: a picture is written as .png, a film as .mp4 or .gif")
+        raise InputError(f"{output}: a picture is written as .png, a film as .mp4, .webp or .gif")
     if output.suffix.lower() == ".mp4":
         _ffmpeg()
 
@@ -35,8 +37,8 @@ def write(output: Path, pictures: Iterable[np.ndarray], frames: list[int], rate:
         kind = output.suffix.lower()
         if kind == ".mp4":
             _write_mp4(output, pictures, rate)
-        elif kind == ".gif":
-            _write_gif(output, pictures, rate)
+        elif kind in FILMS:
+            _write_loop(output, pictures, rate)
         else:
             return list(_write_each(output, pictures, frames))
     except OSError as error:
@@ -51,11 +53,12 @@ def _write_each(output: Path, pictures: Iterable[np.ndarray], frames: list[int])
         yield path
 
 
-def _write_gif(output: Path, pictures: Iterable[np.ndarray], rate: float) -> None:
-    stride = math.ceil(rate / _GIF_RATE)
+def _write_loop(output: Path, pictures: Iterable[np.ndarray], rate: float) -> None:
+    stride = math.ceil(rate / _LOOP_RATE)
     images = (Image.fromarray(picture) for picture in itertools.islice(pictures, None, None, stride))
-    duration = 10 * round(100.0 * stride / rate)  # ms; the format counts in hundredths of a second
-    next(images).save(output, save_all=True, append_images=images, duration=duration, loop=0)
+    duration = 10 * round(100.0 * stride / rate)  # ms; a GIF counts in hundredths of a second
+    options = _WEBP if output.suffix.lower() == ".webp" else {}
+    next(images).save(output, save_all=True, append_images=images, duration=duration, loop=0, **options)
 
 
 def _write_mp4(output: Path, pictures: Iterable[np.ndarray], rate: float) -> None:
@@ -75,5 +78,5 @@ def _ffmpeg():
     try:
         import imageio_ffmpeg  # noqa: PLC0415 - an extra
     except ImportError:
-        raise InputError(f"a film as .mp4 needs {extra('video')}; .gif needs nothing") from None
+        raise InputError(f"a film as .mp4 needs {extra('video')}; .webp and .gif need nothing") from None
     return imageio_ffmpeg

@@ -79,7 +79,7 @@ def render(
 
     Args:
         stage: USD file.
-        output: ``.png`` for pictures; ``.mp4`` or ``.gif`` for a film, at the stage's frame rate.
+        output: ``.png`` for pictures; ``.mp4``, ``.webp`` or ``.gif`` for a film, at the stage's frame rate.
         frame: Frame after the start, at the stage's frame rate; by default the last, for a film all frames.
         frames: First and last frame of several; the name of each picture contains the number of its frame.
         size: Width and height [px].
@@ -104,7 +104,7 @@ def render(
     codes = [clock.start + number * clock.time_codes_per_second / clock.frames_per_second for number in numbers]
     with wp.ScopedDevice(resolve_device(device)):
         scene = import_scene(stage, visuals=True, time_code=min(codes[0], clock.end))
-        renderer = _Renderer(scene, stage, size, arrows)
+        renderer = _StageRenderer(scene, stage, size, arrows)
         line = renderer.choose_camera(camera)
         if on_camera:
             on_camera(line)
@@ -125,62 +125,56 @@ def _numbers(stage, clock: StageClock, output: Path, frame: int | None, frames: 
     return list(range(first, final + 1))
 
 
-class _Renderer:
-    """A stage, imported from ``path`` with its visual shapes, and a camera for pictures of ``size`` [px]."""
+class ModelRenderer:
+    """Pictures of a Newton model, by default from a camera that sees all bodies.
 
-    def __init__(self, scene: ImportedScene, path, size: tuple[int, int], arrows: bool):
-        self._scene, self._motion, (self._width, self._height) = scene, Playback(scene.stage, scene.swarms), size
-        self._arrows = _Arrows(scene, path) if arrows else None
-        with newton_errors(str(path), "use"):
-            self._model = model = scene.builder.finalize()
-        self._state = model.state()
+    The ray tracer is :class:`newton.sensors.SensorCamera`. ::
+
+        renderer = ModelRenderer(model, (320, 180), metal=np.zeros(model.shape_count))
+        picture = renderer.picture(state)  # 8-bit sRGB, shape [180, 320, 3]
+    """
+
+    def __init__(self, model: newton.Model, size: tuple[int, int], metal: np.ndarray):
+        """Look at all bodies of a model.
+
+        Args:
+            model: The model; colors are its ``shape_color``.
+            size: Width and height of the pictures [px].
+            metal: Metalness of each shape, 0 to 1, shape [n].
+
+        Raises:
+            InputError: The version of Newton has no ray tracer.
+        """
+        self._model, (self._width, self._height), self._metal = model, size, metal
         ray_tracer = camera_type()
         self._camera = camera = ray_tracer(model, load_textures=False)
         camera.create_default_light(direction=wp.normalize(wp.vec3(*_SUN)))
         camera.set_ambient_light(*_AMBIENT)
         self._config = ray_tracer.RenderConfig(enable_shadows=True)
-        self._bodies = list(scene.bodies)
-        self._rows = np.array([scene.bodies[prim] for prim in self._bodies], dtype=int)
         self._albedo = _to_linear(model.shape_color.numpy())
-        sources = {
-            label: prim
-            for swarm in scene.swarms
-            for prim, labels in swarm.copies_of(model.shape_label).items()
-            for label in labels
-        }
-        with quiet():
-            metal = {label: metalness(scene.stage, label) for label in model.shape_label if label not in sources}
-        self._metal = np.array([metal[sources.get(label, label)] for label in model.shape_label])
+        self.look_at_bodies()
 
-    def choose_camera(self, name: str | None) -> str:
-        """Set the camera of all pictures, see :func:`render`; return a line of text that names it."""
+    def look_at_bodies(self, direction: tuple[float, float, float] = _VIEW) -> None:
+        """Set a camera that sees all bodies in their initial poses, in a direction from them; z is up."""
         size = _SAMPLES * self._width, _SAMPLES * self._height
-        prim = None if name == AUTO else _camera_prim(self._scene.stage, name)
-        if prim:
-            self._view = _view_of(prim, self._camera, *size)
-            if name or self._sees_bodies():
-                return f"camera {prim.GetPath()}"
-        self._view = _view_of_bodies(self._model, self._camera, *size)
-        return f"all bodies, as the camera {prim.GetPath()} sees none or one from inside" if prim else "all bodies"
+        self._view = _view_of_bodies(self._model, self._camera, *size, np.array(direction))
 
-    def _sees_bodies(self) -> bool:
+    def look_from(self, prim) -> None:
+        """Set the camera of a USD prim."""
+        self._view = _view_of(prim, self._camera, _SAMPLES * self._width, _SAMPLES * self._height)
+
+    def sees_bodies(self, state: newton.State) -> bool:
         """Return True if the view shows a body, or without bodies a shape, and something else beside it."""
-        self._model.bvh_refit_shapes(self._state)
+        self._model.bvh_refit_shapes(state)
         all_rays, pose = self._view
         steps = [max(1, count // least) for count, least in zip(all_rays.shape[:2], _LOOK, strict=True)]
         rays = np.ascontiguousarray(all_rays[:: steps[0], :: steps[1]])
-        _, _, shapes = self._trace(rays, wp.array([pose], dtype=wp.transformf, device=self._model.device))
+        _, _, shapes = self._trace(state, rays, wp.array([pose], dtype=wp.transformf, device=self._model.device))
         return bool(np.isin(shapes, _shown(self._model)).any()) and len(np.unique(shapes)) > 1
 
-    def picture(self, time_code: float) -> np.ndarray:
-        """Return the picture at a time code as 8-bit sRGB, shape [height, width, 3]."""
-        model, state = self._model, self._state
-        self._motion.seek(time_code)
-        poses = model.body_q.numpy()
-        poses[self._rows] = self._motion.poses(self._bodies)
-        state.body_q.assign(poses)
-        if self._arrows:
-            self._arrows.place(model, poses, self._motion)
+    def picture(self, state: newton.State) -> np.ndarray:
+        """Return the picture of a state as 8-bit sRGB, shape [height, width, 3]."""
+        model = self._model
         model.bvh_refit_shapes(state)
         all_rays, pose = self._view
         rotation = np.array(wp.quat_to_matrix(wp.transform_get_rotation(pose))).reshape(3, 3)
@@ -188,12 +182,12 @@ class _Renderer:
         light, up = np.zeros((self._height, self._width, 3)), np.eye(3)[int(model.up_axis)]
         for k in range(_SAMPLES**2):
             rays = np.ascontiguousarray(all_rays[k // _SAMPLES :: _SAMPLES, k % _SAMPLES :: _SAMPLES])
-            scattered, normals, shapes = self._trace(rays, camera_poses)
+            scattered, normals, shapes = self._trace(state, rays, camera_poses)
             directions = rays[..., 0, 1, :] @ rotation.T
             light += _shade(scattered, normals, directions, shapes, self._albedo, self._metal, up)
         return _to_srgb(light / _SAMPLES**2)
 
-    def _trace(self, rays: np.ndarray, poses: wp.array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _trace(self, state, rays: np.ndarray, poses: wp.array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return scattered light, normals and shapes (-1 where a ray hits none), shape [height, width, ...]."""
         camera, shape = self._camera, (1, rays.shape[1], rays.shape[0])
         light: Any = camera.allocate_image_color_hdr(*shape)
@@ -201,9 +195,56 @@ class _Renderer:
         shapes: Any = camera.allocate_image_shape_index(*shape)
         images = {"hdr_color_image": light, "normal_image": normals, "shape_index_image": shapes}
         directions = wp.array(rays, dtype=wp.vec3f, device=self._model.device)
-        camera.update(self._state, poses, directions, **images, render_config=self._config)
+        camera.update(state, poses, directions, **images, render_config=self._config)
         hits = shapes.numpy()[0].astype(np.int64)
         return light.numpy()[0], normals.numpy()[0], np.where(hits < self._model.shape_count, hits, -1)
+
+
+class _StageRenderer:
+    """A stage, imported from ``path`` with its visual shapes, and a camera for pictures of ``size`` [px]."""
+
+    def __init__(self, scene: ImportedScene, path, size: tuple[int, int], arrows: bool):
+        self._scene, self._motion = scene, Playback(scene.stage, scene.swarms)
+        self._arrows = _Arrows(scene, path) if arrows else None
+        with newton_errors(str(path), "use"):
+            self._model = model = scene.builder.finalize()
+        self._state = model.state()
+        self._bodies = list(scene.bodies)
+        self._rows = np.array([scene.bodies[prim] for prim in self._bodies], dtype=int)
+        self._renderer = ModelRenderer(model, size, self._metalness())
+
+    def _metalness(self) -> np.ndarray:
+        """Return the metalness of the materials of all shapes, shape [n]."""
+        scene, labels = self._scene, self._model.shape_label
+        sources = {
+            label: prim
+            for swarm in scene.swarms
+            for prim, copies in swarm.copies_of(labels).items()
+            for label in copies
+        }
+        with quiet():
+            metal = {label: metalness(scene.stage, label) for label in labels if label not in sources}
+        return np.array([metal[sources.get(label, label)] for label in labels])
+
+    def choose_camera(self, name: str | None) -> str:
+        """Set the camera of all pictures, see :func:`render`; return a line of text that names it."""
+        prim = None if name == AUTO else _camera_prim(self._scene.stage, name)
+        if prim:
+            self._renderer.look_from(prim)
+            if name or self._renderer.sees_bodies(self._state):
+                return f"camera {prim.GetPath()}"
+        self._renderer.look_at_bodies()
+        return f"all bodies, as the camera {prim.GetPath()} sees none or one from inside" if prim else "all bodies"
+
+    def picture(self, time_code: float) -> np.ndarray:
+        """Return the picture at a time code as 8-bit sRGB, shape [height, width, 3]."""
+        self._motion.seek(time_code)
+        poses = self._model.body_q.numpy()
+        poses[self._rows] = self._motion.poses(self._bodies)
+        self._state.body_q.assign(poses)
+        if self._arrows:
+            self._arrows.place(self._model, poses, self._motion)
+        return self._renderer.picture(self._state)
 
 
 class _Arrows:
@@ -256,11 +297,13 @@ def _view_of(prim, camera: Any, width: int, height: int) -> tuple[Any, Any]:
     return rays.numpy(), wp.transform(*camera.compute_camera_transforms_usd(prim).numpy()[0])
 
 
-def _view_of_bodies(model: newton.Model, camera: Any, width: int, height: int) -> tuple[Any, Any]:
-    """Return :func:`_view_of` a camera that looks at all bodies."""
+def _view_of_bodies(
+    model: newton.Model, camera: Any, width: int, height: int, direction: np.ndarray
+) -> tuple[Any, Any]:
+    """Return :func:`_view_of` a camera that looks at all bodies, in a direction from them."""
     field = min(_FIELD_OF_VIEW, 2.0 * math.atan(math.tan(0.5 * _FIELD_OF_VIEW) * height / width))
     rays = camera.compute_camera_rays_pinhole(width, height, camera_fov=field, device="cpu")
-    return rays.numpy(), _looking_at_bodies(model, field)
+    return rays.numpy(), _looking_at_bodies(model, field, direction)
 
 
 def _shown(model: newton.Model) -> np.ndarray:
@@ -269,7 +312,7 @@ def _shown(model: newton.Model) -> np.ndarray:
     return np.flatnonzero(shape_body >= 0) if (shape_body >= 0).any() else np.arange(model.shape_count)
 
 
-def _looking_at_bodies(model: newton.Model, field: float) -> wp.transform:
+def _looking_at_bodies(model: newton.Model, field: float, direction: np.ndarray) -> wp.transform:
     """Return a camera pose that sees all shapes of bodies, or all shapes without any, in a view of ``field`` [rad]."""
     shape_body, poses = model.shape_body.numpy(), model.body_q.numpy()
     frames, radii = model.shape_transform.numpy(), model.shape_collision_radius.numpy()
@@ -280,7 +323,7 @@ def _looking_at_bodies(model: newton.Model, field: float) -> wp.transform:
         centers[row] = wp.transform_point(wp.transform(*poses[body]), origin) if body >= 0 else origin
     low, high = (sign * (sign * centers + radii[shown, None]).max(axis=0) for sign in (-1.0, 1.0))
     center, extent = 0.5 * (low + high), 0.5 * np.linalg.norm(high - low)
-    back = np.array(_VIEW) / np.linalg.norm(_VIEW)
+    back = direction / np.linalg.norm(direction)
     right = np.cross((0.0, 0.0, 1.0), back)
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(back, right), back], axis=1)  # the camera looks along its -z, y is up
