@@ -12,8 +12,10 @@ import warp as wp
 from small_builders import add_ball, new_builder
 
 import warpmag
+from bench.reference.ball_in_field import box_field
 from warpmag.declarations.magnets import Magnet
 from warpmag.engine.magnets.attributes import stored_values
+from warpmag.kernels.pairs.wrench import MU0
 from warpmag.moments.probe import FieldProbe
 
 M = (0.0, 0.0, 1e6)
@@ -285,10 +287,51 @@ def test_a_spacing_too_fine_for_a_wide_shape_beside():
     body = builder.add_body()
     builder.add_shape_box(body, hx=0.01, hy=0.01, hz=0.01)
     tilted = wp.transform((1.0, 0.0, 0.0), wp.quat_rpy(0.3, 0.4, 0.5))
-    builder.add_shape_box(body, xform=tilted, hx=20.0, hy=20.0, hz=1e-5)
+    builder.add_shape_box(body, xform=tilted, hx=2.5, hy=2.5, hz=1e-7)
     warpmag.add_inducible(builder, body=body, moment_spacing=0.02)
     with pytest.raises(warpmag.InputError, match="^shape_0: spacing: cells of .* would need .* test points: give"):
         warpmag.Magnetics(builder.finalize(device="cpu"))
+
+
+FOIL = (0.5, 0.5, 5e-5)  # half sides [m]: 62,500 cells of 4 mm, though its volume is that of 1,600 cubes of 4 mm
+
+
+@pytest.mark.parametrize("spacing", [4e-3, 1e-3, 1e-6])
+@pytest.mark.parametrize(("permanent", "most"), [(True, 4096), (False, 20000)])
+def test_a_spacing_too_fine_for_a_foil(permanent, most, spacing):
+    """A foil is one cell across: the number of cells does not follow from its volume."""
+    builder = new_builder()
+    builder.add_shape_box(body := builder.add_body(), hx=FOIL[0], hy=FOIL[1], hz=FOIL[2])
+    if permanent:
+        warpmag.add_permanent(builder, body=body, magnetization=M, moment_spacing=spacing)
+    else:
+        warpmag.add_inducible(builder, body=body, moment_spacing=spacing)
+    with pytest.raises(warpmag.InputError, match=f"^shape_0: spacing: .* needs more than {most} moments"):
+        warpmag.Magnetics(builder.finalize(device="cpu"))
+
+
+@pytest.mark.filterwarnings("ignore:Inertia validation")
+@pytest.mark.parametrize("spacing", [0.0, 0.02])
+def test_a_speck_at_the_edge_of_a_foil(device, spacing):
+    """A magnet 50,000 times smaller than the foil is a moment in its field. Few moments stand for the foil, and the
+    reaction is the opposite force."""
+    center, half, m = np.array([0.5004, 0.1, 1e-3]), 1e-5, np.array([2e5, 1e5, 3e5])
+    builder = new_builder()
+    builder.add_shape_box(foil := builder.add_body(), hx=FOIL[0], hy=FOIL[1], hz=FOIL[2])
+    warpmag.add_permanent(builder, body=foil, magnetization=(0.0, 0.0, 1e6), moment_spacing=spacing)
+    speck = builder.add_body(xform=wp.transform(center, wp.quat_identity()))
+    builder.add_shape_box(speck, hx=half, hy=half, hz=half)
+    warpmag.add_permanent(builder, body=speck, magnetization=m)
+    magnetics = warpmag.Magnetics(builder.finalize(device=device))
+    assert magnetics.system.count <= 4096
+    magnetics.apply(state := magnetics.model.state())
+    step = 1e-6 * np.eye(3)
+    slopes = (box_field(center + step, FOIL, 1e6) - box_field(center - step, FOIL, 1e6)) / 2e-6  # ∂H_i/∂x_k, [k, i]
+    expected = MU0 * (2.0 * half) ** 3 * slopes @ m
+    forces = state.body_f.numpy()[:, :3]
+    size = np.linalg.norm(expected)
+    np.testing.assert_allclose(forces[speck], expected, atol=1e-3 * size)
+    np.testing.assert_allclose(forces[foil], -forces[speck], atol=1e-5 * size)
 
 
 def test_a_probe_of_as_many_points_as_numpy_counts(device):

@@ -1,5 +1,7 @@
-// Forces between permanent bodies near each other: the surface charges of one body in the field of the other. Farther
-// off, the moments of one body in the field of the other's.
+// Forces between permanent bodies near each other: the surface charges of one body in the potentials of the other.
+// Bodies farther apart than the moments of the smaller body require: these moments in the closed form of the larger
+// body. Potentials of a large body differ too little across a small one for single precision. Farther off still, the
+// moments of one body in the field of the other's.
 #pragma once
 #include "applied/target_field.h"
 
@@ -54,30 +56,34 @@ CUDA_CALLABLE inline Wrench wrench_on_charges(const Arrays& arrays, const Perman
     return {q.frame.to_world(wrench.force), q.frame.to_world(wrench.torque), wrench.energy};
 }
 
-// Wrench of the moments that replace body s at a distance on those of body q. The torque is about ``center``.
+// Wrench of body s on the moments that replace body q at a distance, by the closed form of s if ``closed``, else by
+// such moments of s. The torque is about ``center``.
 template <class Arrays>
 CUDA_CALLABLE inline Wrench wrench_on_moments(const Arrays& arrays, const PermanentBody& q, const PermanentBody& s,
-                                              Real3 center) {
+                                              bool closed, Real3 center) {
+    const Number zero = Number(Real(0));
     const int* const tables = arrays.solids.shape.data + SHAPE_ROW * (size_t)q.shape;
     Wrench wrench = zero_wrench();
     for (int i = WIDTH * share(); i < tables[11]; i += WIDTH * SHARES) {
         const Real* const at = rows_at(arrays.solids.moment.data, MOMENT_ROW, tables[10] + i);
         const Vector x = q.frame.to_world(own_vector(at)) + broadcast(q.frame.origin);
-        const CurlFreeField field = s.frame.to_world(moments_field(arrays, s, s.frame.point_to_body(x), 0, 1));
-        add_wrench(wrench, first_lanes(tables[11] - i), target_field(field),
+        const Vector at_s = s.frame.point_to_body(x);
+        const CurlFreeField field =
+            closed ? field_of(s.solid, s.m, at_s, zero, 0, 1) : moments_field(arrays, s, at_s, 0, 1);
+        add_wrench(wrench, first_lanes(tables[11] - i), target_field(s.frame.to_world(field)),
                    numbers(at + 3 * CHUNK) * broadcast(q.m_world), x, center);
     }
     return wrench;
 }
 
-// Force/μ0, torque/μ0 and energy/μ0 of body s on body q, less those between their moments in the system. ``close`` is
-// true for surface charges of q in the closed form of s. The torque is about the first moment of q; all results are in
-// the world's frame.
+// Force/μ0, torque/μ0 and energy/μ0 of body s on body q, less those between their moments in the system. ``charges`` is
+// true for the surface charges of q, false for its moments; ``closed`` for the closed form of s. The torque is about
+// the first moment of q; all results are in the world's frame.
 template <class Arrays>
-CUDA_CALLABLE inline void body_wrench(const Arrays& arrays, const PermanentBody& q, const PermanentBody& s, bool close,
-                                      Real3& force, Real3& torque, Real& energy) {
+CUDA_CALLABLE inline void body_wrench(const Arrays& arrays, const PermanentBody& q, const PermanentBody& s,
+                                      bool charges, bool closed, Real3& force, Real3& torque, Real& energy) {
     const Real3 center = reference_point(arrays, q);
-    Wrench wrench = close ? wrench_on_charges(arrays, q, s, center) : wrench_on_moments(arrays, q, s, center);
+    Wrench wrench = charges ? wrench_on_charges(arrays, q, s, center) : wrench_on_moments(arrays, q, s, closed, center);
     const Number minus = Number(Real(-INVERSE_4PI));
     for (int i = q.first + WIDTH * share(); i < q.first + q.count; i += WIDTH * SHARES) {
         const size_t pitch = arrays.packed.strides[0] / sizeof(Real);

@@ -198,7 +198,7 @@ CUDA_CALLABLE inline void add_body_pairs(const Arrays& arrays, int b, Real (&tot
         if (!is_within(q.far_reach, s.far_reach)) continue;
         Real3 force, torque;
         Real energy;
-        body_wrench(arrays, q, s, is_within(q.reach, s.reach), force, torque, energy);
+        body_wrench(arrays, q, s, is_within(q.reach, q.reach), is_within(q.reach, s.reach), force, torque, energy);
         if (is_smaller) add_force_torque(total, force, torque, MU0);
         else {
             const Real3 arm_torque = cross(reference_point(arrays, q) - reference_point(arrays, s), force);

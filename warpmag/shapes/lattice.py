@@ -214,13 +214,20 @@ def ball(radius: float) -> Lattice:
     return Lattice(np.zeros((1, 3)), np.array([4.0 / 3.0 * np.pi * r**3]), np.zeros(1, int))
 
 
-def fits(boxes: Sequence[np.ndarray], spacing: float) -> bool:
-    """Return False if a body with these bounding boxes [m] surely needs more than :data:`LARGEST_COUNT` moments."""
-    with np.errstate(over="ignore"):
-        return not sum(np.prod(box / spacing) for box in boxes) > 4.0 * LARGEST_COUNT
+def fits(boxes: Sequence[np.ndarray], spacing: float, largest: int = LARGEST_COUNT) -> bool:
+    """Return False if a body with these bounding boxes [m] surely needs more than ``largest`` moments."""
+    with np.errstate(over="ignore"):  # a shape thinner than the spacing has one cell across
+        return not sum(np.prod(np.maximum(box / spacing, 1.0)) for box in boxes) > 4.0 * largest
 
 
-def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1, *, together: bool = False) -> Lattice:
+def fill(
+    solids: Solid | Sequence[Solid],
+    spacing: float = 0.0,
+    across: int = 1,
+    *,
+    together: bool = False,
+    largest: int = LARGEST_COUNT,
+) -> Lattice:
     """Fill a body with moments. Their total volume is exact, or accurate to about 1 % if shapes overlap.
 
     Args:
@@ -232,19 +239,26 @@ def fill(solids: Solid | Sequence[Solid], spacing: float = 0.0, across: int = 1,
             :data:`FLATTEST`. Thinner shapes have fewer cells across.
         together: True if all shapes share one grid, in the frame of the largest, which tensors between them require. A
             cell in several shapes then gives a moment of each shape.
+        largest: Largest number of moments at a given spacing.
+
+    Raises:
+        InputError: No shape, a spacing that is negative or not finite, or one that needs more moments than ``largest``.
     """
     parts = [solids] if isinstance(solids, Solid) else list(solids)
     if not parts:
         raise InputError("solids: a body needs at least one shape")
     if not (np.isfinite(spacing) and spacing >= 0.0):
         raise InputError(f"spacing: must be zero or positive and finite, got {spacing}")
-    if spacing > 0.0:
-        if not fits([p.upper - p.lower for p in parts], spacing):
-            raise InputError(f"spacing: {spacing} m needs more than {LARGEST_COUNT} moments for one body")
+    too_many = InputError(f"spacing: {spacing:g} m needs more than {largest} moments for one body")
+    if spacing > 0.0 and not fits([p.upper - p.lower for p in parts], spacing, largest):
+        raise too_many
     most = max(AUTOMATIC_COUNT, across**3 * len(parts))
     automatic, across = _automatic_cells(parts, across, most, together)
     if spacing > 0.0:
-        return _fill(parts, spacing, across if spacing < automatic else 1, together)
+        lattice = _fill(parts, spacing, across if spacing < automatic else 1, together)
+        if len(lattice.volumes) > largest:
+            raise too_many
+        return lattice
     spacing = automatic
     lattice = _fill(parts, spacing, across, together)
     while len(lattice.volumes) > most:

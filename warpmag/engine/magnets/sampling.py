@@ -25,6 +25,9 @@ from warpmag.shapes.uniform_response import with_surface_response
 
 _REACH = 3.0
 """Distance up to which the closed form of a magnet replaces its lattice of cells, in cell sizes."""
+_LARGEST_CLOSED_FORM = 4096
+"""Largest number of moments of a permanent magnet whose near field has a closed form. Only fields of coils and field
+maps are the more accurate for more of them. The force between two magnets near each other visits all pairs of them."""
 _ROUNDING = 1e-5
 """Relative difference up to which sizes and frames of shapes are equal: 80 units in the last place of float32. Frames
 come from products of transforms, which round differently for each instance of a prototype."""
@@ -129,7 +132,10 @@ class ShapeSampler:
         surfaces = self._polyhedra(shapes, solids) if permanent else []
         if surfaces and fixed and spacing == 0.0:
             return self._sample_closed_forms(shapes, solids, surfaces)
-        filled = lattice.fill(solids, spacing, 1 if fixed else lattice.LEAST_ACROSS, together=not fixed)
+        across, largest = (1 if fixed else lattice.LEAST_ACROSS), lattice.LARGEST_COUNT
+        if fixed and surfaces:
+            largest = _LARGEST_CLOSED_FORM
+        filled = lattice.fill(solids, spacing, across, together=not fixed, largest=largest)
         counts = np.bincount(filled.owners, minlength=len(solids))
         ends, grids = np.cumsum(counts), filled.pieces if fixed else filled.pieces * len(solids)
         parts = []
