@@ -249,6 +249,13 @@ def test_wrong_array(name, wrong, world):
         call(world, array)
 
 
+@pytest.mark.parametrize("wrong", ["text", "an object", "a ragged list", "NaN", "of quaternions", *WRONG_SIZES])
+def test_wrong_sharing(wrong, world):
+    array = world.vectors(wrong, wp.int32) if isinstance(wrong, int) else WRONG_ARRAYS[wrong](world, wp.int32)
+    with pytest.raises(warpmag.InputError, match="^sharing: must be a Warp array of int32 of shape "):
+        world.magnetics.induce(world.state, 1e-3, sharing=array)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

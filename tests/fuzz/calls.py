@@ -44,12 +44,13 @@ SECONDS, MEMORY = 60, 8 << 30
 M = (0.0, 0.0, 1e6)
 POINTS = np.array([(0.0, 0.0, 0.05), (0.02, 0.0, 0.0)])
 KEYS = Keys(np.array([0.0, 1.0]), np.array([[1.0], [2.0]]), "linear").to_text()
+TIME_STEP = 1e-3  # s
 OFTEN = 50
 """Calls without arguments after which a world is made anew; calls with arguments make it anew if they were taken."""
 
 
 def new_world(balls: int = 2) -> dict[str, Any]:
-    """Return right arguments by name: a model of balls, iron, a coil and a site, with all that takes its states."""
+    """Return right arguments by name: a model of balls, iron, coils and a site, with all that takes its states."""
     builder = newton.ModelBuilder()
     warpmag.register_attributes(builder)
     for number in range(balls):
@@ -61,11 +62,12 @@ def new_world(balls: int = 2) -> dict[str, Any]:
         else:
             warpmag.add_permanent(builder, body=body, magnetization=M)
     coil = warpmag.add_coil(builder, body=0, radius=0.01, ampere_turns=1.0, label="coil")
+    warpmag.add_coil(builder, body=0, radius=0.01, wire_radius=1e-4, resistance=1.0, turns=10, label="driven")
     builder.add_site(0, label="site")
     model = builder.finalize(device="cpu")
     model.warpmag.current_keys[coil] = KEYS  # as USD's importer leaves them
     magnetics, state = warpmag.Magnetics(model), model.state()
-    magnetics.apply(state)
+    magnetics.apply(state, dt=TIME_STEP)
     viewer = newton.viewer.ViewerNull()
     return {
         **{"builder": builder, "scene": builder, "model": model, "state": state, "magnetics": magnetics},
@@ -77,6 +79,7 @@ def new_world(balls: int = 2) -> dict[str, Any]:
             "voltage": 2.0,
             "external_field": (0.0, 0.0, 1e4),
             "count": 2,
+            "dt": TIME_STEP,
         },
         **{"magnetization": M, "magnetizations": {1: M}, "material": "iron", "time": 0.0, "frames": 1, "radius": 0.005},
         **{"origin": (0.0, 0.0, 0.0), "spacing": 0.01, "values": np.ones((3, 3, 3, 3)), "name": "iron"},
@@ -121,10 +124,11 @@ LIBRARIES = _importable("torch", "jax")
 SINGLE = {
     "MagnetizationCurve.from_mh": {"magnetizations": [0.0, 5e5, 1e6]},
     "MagnetizationCurve.from_csv": {"path": str(Path(__file__).with_name("curve.csv"))},
+    "Magnetics.set_voltage": {"coil": "driven"},
     "sweep": {"simulate": list, "world_count": 4, "together": 2},
 }
 """Right arguments of one function alone."""
-USUAL = ("body", "magnetization", "saturation", "radius", "device", "dtype")
+USUAL = ("body", "magnetization", "saturation", "radius", "device", "dtype", "dt")
 """Optional arguments that are given in most calls, as users do."""
 PASSIVE = {"persistent_arrays", "stepped_arrays", "warnings", "frame", "allow_restart", "stay"}
 """Methods without arguments that return no numbers, or only when a viewer is closed."""
@@ -283,7 +287,7 @@ class Caller:
         """Use what the call was about, then replace it."""
         try:
             magnetics, state = self.world["magnetics"], self.world["model"].state()
-            magnetics.apply(state)
+            magnetics.apply(state, dt=TIME_STEP)
             arrays = [state.body_f.numpy(), magnetics.b_field(POINTS)]
             if simulation := self.owners.get("Simulation"):
                 simulation.step()

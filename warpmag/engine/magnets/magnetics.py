@@ -335,10 +335,15 @@ class Magnetics:
             state: State with poses ``body_q``.
             dt: Time [s] by which the currents of coils with voltages advance; by default they stay.
             sharing: Factor of ``dt`` on the device, int32, shape [1]: the larger one of this number and 2.
+
+        Raises:
+            InputError: An argument has another type, size or device than it must have, or ``dt`` is not positive.
         """
         values, system = self._values, self.system
         if dt is not None:
             check_positive("dt", dt)
+        if sharing is not None:
+            check_warp_array("sharing", sharing, wp.int32, self._model.device, (1,))
         self._check_state(state, "body_q")
         check_untaped(self._gradients.arguments(state), "only Magnetics.apply records one")
         self._induced = True
