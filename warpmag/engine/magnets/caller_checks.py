@@ -11,7 +11,7 @@ import newton
 import warp as wp
 
 from warpmag.declarations.attributes import NAMESPACE
-from warpmag.declarations.checks import short_repr
+from warpmag.declarations.checks import check_positive, short_repr
 from warpmag.errors import InputError
 from warpmag.moments.arrays import check_warp_array
 
@@ -69,6 +69,14 @@ def check_state(state: Any, model: newton.Model, *names: str) -> None:
         own: Any = getattr(model, _MODEL_NAMES.get(name, name))
         if own is not None and own.size:
             check_warp_array(f"state: {name}", getattr(state, name), own.dtype, own.device, own.shape)
+
+
+def check_duration(dt: float | None, sharing: wp.array | None, device: Any) -> None:
+    """Raise :class:`InputError` unless ``dt`` and its factor ``sharing`` on ``device`` are right or None."""
+    if dt is not None:
+        check_positive("dt", dt)
+    if sharing is not None:
+        check_warp_array("sharing", sharing, wp.int32, device, (1,))
 
 
 def check_control(control: Any, model: newton.Model) -> None:

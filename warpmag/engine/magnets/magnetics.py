@@ -14,7 +14,7 @@ from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.magnets import MagneticSettings, check_magnetization
 from warpmag.deprecation import renamed_arguments
 from warpmag.engine.magnets.attributes import NAMESPACE
-from warpmag.engine.magnets.caller_checks import check_state, held_by_model
+from warpmag.engine.magnets.caller_checks import check_duration, check_state, held_by_model
 from warpmag.engine.magnets.eddy import gather_velocities, set_conductivities
 from warpmag.engine.magnets.grouping import BodyMagnet, find_magnets
 from warpmag.engine.magnets.imported_field import imported_field
@@ -340,10 +340,7 @@ class Magnetics:
             InputError: An argument has another type, size or device than it must have, or ``dt`` is not positive.
         """
         values, system = self._values, self.system
-        if dt is not None:
-            check_positive("dt", dt)
-        if sharing is not None:
-            check_warp_array("sharing", sharing, wp.int32, self._model.device, (1,))
+        check_duration(dt, sharing, self._model.device)
         self._check_state(state, "body_q")
         check_untaped(self._gradients.arguments(state), "only Magnetics.apply records one")
         self._induced = True
