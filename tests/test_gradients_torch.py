@@ -103,3 +103,13 @@ def test_wrong_arguments_are_one_line(case, device):
     x, m = tensors(device, (3, 3), (3, 3))
     with pytest.raises(warpmag.InputError, match=f"^{message}$"):
         call(warpmag.torch.h_field, x, m)
+
+
+def test_no_places_at_all(device):
+    """Tensors of no vectors have other strides than arrays where NumPy made them."""
+    x, m = tensors(device, (3, 3), (3, 3))
+    nowhere = torch.tensor(np.zeros((0, 3)), device=x.device, requires_grad=True)
+    assert nowhere.stride() == (0, 0)
+    warpmag.torch.h_field(x, m, nowhere).sum().backward()
+    assert x.grad.eq(0.0).all() and m.grad.eq(0.0).all()
+    warpmag.torch.wrench(nowhere, nowhere)[0].sum().backward()

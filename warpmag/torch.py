@@ -141,8 +141,7 @@ def _filled(name: str, value, like, count: int | None):
     A value of another shape, or of no real numbers, raises :class:`InputError`; None for ``count`` takes any number.
     """
     if not isinstance(value, torch.Tensor):
-        array = real_array(name, 0.0 if value is None else value)
-        value = torch.empty(array.shape, dtype=torch.float64).copy_(torch.tensor(array.copy()))  # strides of no vectors
+        value = torch.tensor(real_array(name, 0.0 if value is None else value).copy())
     if value.dtype is torch.bool or value.is_complex():
         raise InputError(f"{name}: must be real numbers, got {value.dtype}")
     tensor = value.to(device=like.device, dtype=like.dtype)
@@ -153,6 +152,11 @@ def _filled(name: str, value, like, count: int | None):
         expected = f"[{'n' if count is None else count}{', 3' * (ndim - 1)}]"
         raise InputError(shape_message(name, expected, tensor))
     return tensor
+
+
+def _contiguous(tensor: torch.Tensor) -> torch.Tensor:
+    """Return a contiguous tensor; Warp requires the usual strides of an empty one, too, which may have others."""
+    return tensor.contiguous() if tensor.numel() else tensor.new_empty(tensor.shape)
 
 
 def _recorded(call, tensors: dict, owners: dict[str, str], needed: str):
@@ -185,7 +189,7 @@ class _Call(torch.autograd.Function):
         needed = ctx.needs_input_grad[2:]
         with _stream(tensors[0]), wp.Tape() as ctx.tape:
             ctx.arrays = [
-                wp.from_torch(tensor.detach().contiguous(), scalar if name in _SCALARS else vector, requires_grad=grad)
+                wp.from_torch(_contiguous(tensor.detach()), scalar if name in _SCALARS else vector, requires_grad=grad)
                 for name, tensor, grad in zip(names, tensors, needed, strict=True)
             ]
             ctx.results = call(dtype, **dict(zip(names, ctx.arrays, strict=True)))
@@ -196,13 +200,15 @@ class _Call(torch.autograd.Function):
     def backward(ctx, *cotangents):
         """Return the gradients of the tensors that require one."""
         with _stream(cotangents[0]):
-            for array in ctx.arrays:
-                if array.requires_grad:
+            leaves = [array if array.requires_grad and array.size else None for array in ctx.arrays]
+            for array in leaves:
+                if array is not None:
                     array.grad.zero_()
             for result, cotangent in zip(ctx.results, cotangents, strict=True):
-                wp.copy(result.grad, wp.from_torch(cotangent.contiguous(), result.dtype))
+                if result.size:  # an array without entries has no gradient
+                    wp.copy(result.grad, wp.from_torch(_contiguous(cotangent), result.dtype))
             ctx.tape.backward()
-        gradients = [wp.to_torch(array.grad).clone() if array.requires_grad else None for array in ctx.arrays]
+        gradients = [None if array is None else wp.to_torch(array.grad).clone() for array in leaves]
         return None, None, *gradients
 
 
