@@ -24,8 +24,8 @@ SNIPPET = re.compile(r"^(?:```python|<!-- python)\n(.*?)^(?:```|-->)$", re.MULTI
 IMPORT = re.compile(r"^(?:import|from) (\w+)", re.MULTILINE)
 MISSING = {name for name in ("torch", "isaaclab") if importlib.util.find_spec(name) is None}
 """Libraries of some pages that the tests do not install; ``.ci/isaaclab`` runs these pages with them."""
-STAGE = re.compile(r"^```\n(#usda 1\.0\n# (\S+)\n.*?)^```$", re.MULTILINE | re.DOTALL)
-"""A whole stage and the file to save it as."""
+FILE = re.compile(r"^```(?:xml)?\n((?:#usda 1\.0\n# |<!-- )(\S+).*?)^```$", re.MULTILINE | re.DOTALL)
+"""A whole stage or MJCF and the file to save it as."""
 COMMAND = re.compile(r"^(?:pip install uv && uv run )?(warpmag .*)$", re.MULTILINE)
 SLOW = (
     "physics.md",
@@ -58,8 +58,8 @@ def pages_with_programs():
 def test_snippets_run(page, device, tmp_path, monkeypatch):
     """One after the other, as a reader would type them; they assert what they claim."""
     monkeypatch.chdir(tmp_path)
-    for stage in STAGE.finditer(page.read_text(encoding="utf-8")):
-        (tmp_path / stage[2]).write_text(stage[1], encoding="utf-8")
+    for file in FILE.finditer(page.read_text(encoding="utf-8")):
+        (tmp_path / file[2]).write_text(file[1], encoding="utf-8")
     path = tmp_path / f"page_{page.stem}.py"
     path.write_text(program(page), encoding="utf-8")
     with wp.ScopedDevice(device), np.errstate(over="ignore"):
