@@ -121,6 +121,7 @@ REFUSED = {
         ball('string xformOpOrder = "xformOp:translate"'),
         "/Ball: xformOpOrder must be a TokenArray",
     ),
+    "rotation that is text": (ball('string physics:localRot0 = "x"'), "/Ball: physics:localRot0 must be a quaternion"),
     "order that is a number": (ball("bool xformOpOrder = 1"), "/Ball: xformOpOrder must be a TokenArray"),
     "far away": (
         posed(["xformOp:translate"], "double3 xformOp:translate = (1e25, 0, 0)"),
@@ -165,6 +166,7 @@ def test_refused_with_one_line(tmp_path, capfd, case):
 
 
 SOUND = {
+    "sizes of other shapes": ball('string height = "x"', "double[] size = [1, 2]"),
     "infinities that are the schema's own": ball(
         "point3f physics:centerOfMass = (-inf, -inf, -inf)", "float newton:contactGap = -inf"
     )

@@ -276,6 +276,13 @@ def test_refused_with_one_line_that_names_the_prim(tmp_path, case):
     assert message in str(caught.value)
 
 
+@pytest.mark.parametrize("order", ["int xformOpOrder = -1", 'string xformOpOrder = "xformOp:scale"'])
+def test_a_prototype_with_an_order_of_another_type(tmp_path, order):
+    inner = BALL.replace("{", f"{{ {order}\n", 1)
+    with pytest.raises(InputError, match="^/World/Many/Kinds/Ball: xformOpOrder must be a TokenArray, got "):
+        check(write(tmp_path, instancer(["Ball"], [0], [(0, 0, 0)], inner=inner)))
+
+
 def test_an_instancer_within_itself(tmp_path):
     path = write(tmp_path, instancer(["Ball"], [0], [(0, 0, 0)], inner=BALL).replace("/Kinds/Ball", ""))
     with pytest.raises(InputError, match=r"^/World/Many: a PointInstancer that is part of its own prototypes"):

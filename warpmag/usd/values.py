@@ -43,6 +43,7 @@ _RANGES = {  # least, largest, and whether 0 means "not given"
 }
 _TOKENS = {**dict.fromkeys(("axis", "physics:axis"), ("X", "Y", "Z")), "orientation": ("rightHanded", "leftHanded")}
 _QUATERNIONS = ("physics:principalAxes", "physics:localRot0", "physics:localRot1")
+_QUATERNION_TYPES = (Gf.Quatf, Gf.Quatd, Gf.Quath)
 _INERTIA_TOLERANCE = 1e-2
 """Largest excess of an often rounded moment of inertia over the other two, as a fraction of the sum of all three."""
 _READ_NAMESPACES = ("physics:", "newton:", "mjc:", "drive:", "limit:")
@@ -318,7 +319,7 @@ def _check_numbers(prim, name, value, fallback) -> None:
 def _broken_condition(name, value) -> str:
     """Return the condition that the numbers of a value violate together, empty where they violate none."""
     if name in _QUATERNIONS:
-        norm = float(np.linalg.norm(_numbers(value)))
+        norm = float(np.linalg.norm(_numbers(value))) if isinstance(value, _QUATERNION_TYPES) else np.inf
         if abs(norm - 1.0) > 1e-2 and not (norm == 0.0 and name == "physics:principalAxes"):
             return "must be a quaternion of length 1"
     if name == "physics:diagonalInertia" and 2.0 * max(value) > (1.0 + _INERTIA_TOLERANCE) * sum(value):
@@ -330,7 +331,7 @@ def _numbers(value) -> np.ndarray | None:
     """Return the numbers of a value, None for tokens and the like."""
     if isinstance(value, (bool, str)):
         return None
-    if isinstance(value, (Gf.Quatf, Gf.Quatd, Gf.Quath)):
+    if isinstance(value, _QUATERNION_TYPES):
         value = (value.GetReal(), *value.GetImaginary())
     try:
         return np.array(value, dtype=float).ravel()

@@ -71,7 +71,7 @@ def _size_findings(prim, largest) -> Iterator[Finding]:
         return
     lengths = np.linalg.norm(_axes(prim), axis=1)
     for name, size in zip(_SIZES, sizes, strict=False):
-        if size is not None and not (SMALLEST_SIZE <= size * lengths.min() and size * lengths.max() <= largest):
+        if isinstance(size, float) and not (SMALLEST_SIZE <= size * lengths.min() and size * lengths.max() <= largest):
             scaled = f"{name} {size:g} scaled by {lengths.min():g} to {lengths.max():g}"
             yield Finding(str(prim.GetPath()), f"{scaled} must be from {SMALLEST_SIZE:g} to {largest:g} m")
 

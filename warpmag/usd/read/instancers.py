@@ -18,6 +18,7 @@ from warpmag.usd.read.prims import descendants, is_body, is_collider, is_physica
 from warpmag.usd.read.session import INSTANCES, add_layer, release, release_instances
 from warpmag.usd.read.trial_read import MOST_PRIMS
 from warpmag.usd.schemas import MAGNET_API, MOMENT, has_api
+from warpmag.usd.values import value_of
 
 _TYPES = Sdf.ValueTypeNames
 _NAME = "instance"
@@ -239,7 +240,7 @@ class _Instances:
 
 def _prototype(root: Usd.Prim) -> _Prototype:
     transforms, prims = UsdGeom.XformCache(), list(descendants(root))
-    order = UsdGeom.Xformable(root).GetXformOpOrderAttr().Get() if root.IsA(UsdGeom.Xformable) else None
+    order = value_of(root, "xformOpOrder") if root.IsA(UsdGeom.Xformable) else None
     to_parent = transforms.GetParentToWorldTransform(root).GetInverse()
     bodies = tuple(
         (prim.GetPath().MakeRelativePath(root.GetPath()), transforms.GetLocalToWorldTransform(prim) * to_parent)

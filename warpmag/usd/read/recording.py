@@ -14,6 +14,7 @@ from warpmag.usd.read.opening import freeze
 from warpmag.usd.read.prims import is_body, lineage
 from warpmag.usd.read.transforms import is_animated, rigid_part, rotation_of
 from warpmag.usd.schemas import MAGNET_API, MOMENT, SCENE_API, has_api
+from warpmag.usd.values import value_of
 
 TRANSLATE, ORIENT, SCALE = (f"xformOp:{kind}:warpmag" for kind in ("translate", "orient", "scale"))
 """Transform operations of a body in a run, in this order."""
@@ -129,7 +130,7 @@ class _Poses:
 
     def read(self, prim: Usd.Prim) -> tuple[np.ndarray, np.ndarray]:
         """Return positions, shape [f, 3], and quaternions, shape [f, 4]; poses that a run wrote are unchanged."""
-        order = list(UsdGeom.Xformable(prim).GetXformOpOrderAttr().Get() or ())
+        order = list(value_of(prim, "xformOpOrder") or ())
         resets = order[:1] == ["!resetXformStack!"]
         recorded = order[resets:] in ([TRANSLATE, ORIENT], [TRANSLATE, ORIENT, SCALE])
         if not (recorded and (resets or _parents_are_still(prim))):
