@@ -30,6 +30,7 @@ COMMAND = re.compile(r"^(?:pip install uv && uv run )?(warpmag .*)$", re.MULTILI
 SLOW = (
     "physics.md",
     *(f"howto/{name}.md" for name in ("coils", "design", "energy", "gradients", "holding", "mujoco", "newton")),
+    *(f"tutorials/{name}.md" for name in ("blender", "coils", "robot")),
 )
 """Pages that take long, most of them to compile kernels that no other test needs; ``.ci/run`` runs them, too."""
 
@@ -70,6 +71,13 @@ def test_snippets_run(page, device, tmp_path, monkeypatch):
 def test_commands_are_understood(page):
     for command in COMMAND.finditer(page.read_text(encoding="utf-8")):
         cli._parser().parse_args(shlex.split(command[1])[1:])
+
+
+@pytest.mark.parametrize("page", sorted((DOCS / "tutorials").glob("*.md")), ids=lambda page: page.stem)
+def test_notebooks_follow_their_pages(page):
+    """``docs/make_notebooks.py`` makes them; ``test_snippets_run`` runs their code."""
+    made = runpy.run_path(str(DOCS / "make_notebooks.py"))["notebook"](page)
+    assert (DOCS / "notebooks" / f"{page.stem}.ipynb").read_text(encoding="utf-8") == made
 
 
 def test_every_public_name_is_described():

@@ -1,6 +1,5 @@
 """Writes pictures as single files, or as a film."""
 
-import itertools
 import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -53,10 +52,14 @@ def _write_each(output: Path, pictures: Iterable[np.ndarray], frames: list[int])
         yield path
 
 
+def stride_of(output: Path, rate: float) -> int:
+    """Return the stride of the frames that a film has, of those at a rate [Hz]."""
+    return 1 if output.suffix.lower() == ".mp4" else math.ceil(rate / _LOOP_RATE)
+
+
 def _write_loop(output: Path, pictures: Iterable[np.ndarray], rate: float) -> None:
-    stride = math.ceil(rate / _LOOP_RATE)
-    images = (Image.fromarray(picture) for picture in itertools.islice(pictures, None, None, stride))
-    duration = 10 * round(100.0 * stride / rate)  # ms; a GIF counts in hundredths of a second
+    images = (Image.fromarray(picture) for picture in pictures)
+    duration = 10 * round(100.0 / rate)  # ms; a GIF counts in hundredths of a second
     options = _WEBP if output.suffix.lower() == ".webp" else {}
     next(images).save(output, save_all=True, append_images=images, duration=duration, loop=0, **options)
 

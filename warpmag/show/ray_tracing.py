@@ -100,7 +100,10 @@ def render(
     if min(size) < 1 or max(size) > 2**14:
         raise InputError(f"size: must be 1 to 16384, got {size[0]} x {size[1]}")
     clock = stage_clock(open_deferred(stage)[0])
-    numbers = _numbers(stage, clock, output, frame, frames)
+    numbers, rate = _numbers(stage, clock, output, frame, frames), clock.frames_per_second
+    if output.suffix.lower() in films.FILMS:
+        stride = films.stride_of(output, rate)
+        numbers, rate = numbers[::stride], rate / stride
     codes = [clock.start + number * clock.time_codes_per_second / clock.frames_per_second for number in numbers]
     with wp.ScopedDevice(resolve_device(device)):
         scene = import_scene(stage, visuals=True, time_code=min(codes[0], clock.end))
@@ -109,7 +112,7 @@ def render(
         if on_camera:
             on_camera(line)
         pictures = (renderer.picture(code) for code in codes)
-        return films.write(output, pictures, numbers, clock.frames_per_second)
+        return films.write(output, pictures, numbers, rate)
 
 
 def _numbers(stage, clock: StageClock, output: Path, frame: int | None, frames: tuple[int, int] | None) -> list[int]:
