@@ -1,6 +1,7 @@
 """Makes the notebooks of ``docs/notebooks/`` from the pages of ``docs/tutorials/``: ``python docs/make_notebooks.py``.
 
-Blocks of Python become cells of code, commands cells that start with ``!``, and stages cells that write their files. The notebooks hold no outputs. A test compares them with the pages, and another runs the code of the pages.
+Blocks of Python become cells of code, commands cells that start with ``!``, and stages cells that write their files.
+The notebooks hold no outputs. A test compares them with the pages, and another runs the code of the pages.
 """
 
 import json
@@ -20,7 +21,7 @@ def notebook(page: Path) -> str:
         if part.startswith("<!--") or not part.strip():
             continue
         code = part.startswith("```")
-        text = _code(part) if code else re.sub(r"\]\(\.\./", "](../../docs/", part.strip())
+        text = _code(part) if code else part.strip()
         cell = {"cell_type": "code" if code else "markdown", "id": f"cell-{len(cells)}", "metadata": {}}
         cell["source"] = text.splitlines(keepends=True)
         cells.append(cell | ({"execution_count": None, "outputs": []} if code else {}))
