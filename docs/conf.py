@@ -94,7 +94,8 @@ GENERATED = {"schemas": _schemas, "command": _commands, **{name: partial(_file, 
 
 
 def _fill_in(app, page, source):
-    source[0] = re.sub(r"^<!-- (\S+) -->$", lambda marker: GENERATED[marker[1]](), source[0], flags=re.MULTILINE)
+    names = "|".join(map(re.escape, GENERATED))
+    source[0] = re.sub(rf"^<!-- ({names}) -->$", lambda marker: GENERATED[marker[1]](), source[0], flags=re.MULTILINE)
 
 
 def setup(app):

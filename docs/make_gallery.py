@@ -118,16 +118,22 @@ def film_example(name: str) -> None:
     films.write(FOLDER / f"{name}.webp", camera.pictures, [], (len(times) - 1) / (times[-1] - times[0]))
 
 
+def picture(name: str) -> str:
+    """Return the path of a film from the page, or of the finished picture of a scene without one."""
+    film = FOLDER / f"{name}.webp"
+    return (film if film.exists() else DOCS / "pictures" / f"{name}.jpg").relative_to(DOCS).as_posix()
+
+
 def page() -> str:
     """Return the page of the gallery."""
-    head = "# Gallery\n\n`docs/make_gallery.py` runs each scene and example and draws these films.\n\n"
+    head = "# Gallery\n\n`docs/make_gallery.py` runs each scene and example and draws these films by ray tracing.\n\n"
     entries = [(f"warpmag run {name}", scene_line(name), name) for name in SCENES]
     examples_of = [(f"python -m warpmag.examples {name}", line, name) for name, line in examples.get_examples().items()]
     sections = (("Scenes", entries), ("Examples", examples_of))
     return head + "\n".join(
         f"## {title}\n\n"
         + "\n".join(
-            f"{line.rstrip('.')}:\n\n```\n{command}\n```\n\n![{line}](pictures/gallery/{name}.webp)\n"
+            f"{line.rstrip('.')}:\n\n```\n{command}\n```\n\n![{line}]({picture(name)})\n"
             for command, line, name in rows
         )
         for title, rows in sections
