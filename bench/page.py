@@ -54,10 +54,10 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
 def sources(data: Machines) -> str:
     """Return the table of machines, commits and versions."""
     rows = [
-        [name, lines[0]["machine"], lines[0]["commit"], f"Python {lines[0]['python']}, Warp {lines[0]['warp']}"]
+        [name, lines[0]["machine"], lines[0]["commit"], f"{lines[0]['python']}, {lines[0]['warp']}"]
         for name, lines in data.items()
     ]
-    return _table(["device", "processor", "commit", "versions"], rows)
+    return _table(["device", "processor", "commit", "Python, Warp"], rows)
 
 
 def steps(data: Machines) -> str:
@@ -76,26 +76,27 @@ def steps(data: Machines) -> str:
 
 
 def fields(data: Machines) -> str:
-    """Return the table of the field of all pairs, by warpmag and its peers."""
-    rows = []
+    """Return the tables of the field of all pairs, by warpmag and its peers."""
+    text = ""
     for name, lines in data.items():
-        compared = _cases(lines, "compare")
-        for line in sorted(compared, key=lambda line: (line["count"], line["seconds"])):
-            cells = [line["peer"], _time([line]), f"{line['pairs_per_second']:.2g}", f"{line['error']:.0e}"]
-            rows.append([name, f"{line['count']:,}", *cells])
-    return _table(["device", "balls", "program", "time", "pairs/s", "error"], rows)
+        compared = sorted(_cases(lines, "compare"), key=lambda line: (line["count"], line["seconds"]))
+        rows = [[f"{line['count']:,}", f"`{line['peer']}`", _time([line]), f"{line['error']:.0e}"] for line in compared]
+        text += f"\n**{name}**\n" + _table(["balls", "program", "time", "error"], rows)
+    return text
 
 
 def multipoles(data: Machines) -> str:
-    """Return the table of sums over many moments."""
-    names = {"direct": "all pairs", "fmm": "fast multipole method", "fmm3d": "FMM3D, float64"}
-    rows = []
+    """Return the tables of sums over many moments."""
+    names = {"direct": "all pairs", "fmm": "multipoles", "fmm3d": "FMM3D, float64"}
+    text = ""
     for name, lines in data.items():
+        rows = []
         for line in _cases(lines, "many"):
-            method = names[line["method"]] + (f", `rtol={line['rtol']:g}`" if line["rtol"] else "")
+            method = names[line["method"]] + (f", {line['rtol']:g}" if line["rtol"] else "")
             quantity = {"field": "field", "wrench": "force, torque"}[line["quantity"]]
-            rows.append([name, f"{line['count']:,}", quantity, method, _time([line]), f"{line['error']:.0e}"])
-    return _table(["device", "moments", "quantity", "method", "time", "error"], rows)
+            rows.append([f"{line['count']:,}", quantity, method, _time([line]), f"{line['error']:.0e}"])
+        text += f"\n**{name}**\n" + _table(["moments", "quantity", "method", "time", "error"], rows)
+    return text
 
 
 def worlds(data: Machines) -> str:

@@ -20,13 +20,14 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx.ext.mathjax",
+    "sphinx_design",  # cards
     "sphinx-mathjax-offline",  # formulas without a network
 ]
 exclude_patterns = ["paper/*"]
 html_theme = "furo"
 html_title = f"warpmag {release}"
 
-myst_enable_extensions = ["dollarmath"]
+myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 
 autodoc_member_order = "bysource"

@@ -90,7 +90,8 @@ class Camera(newton.viewer.ViewerNull):
 def scene_line(name: str) -> str:
     """Return the first line of the documentation of a bundled scene."""
     layer = Sdf.Layer.FindOrOpen(str(Path(scenes_usd.__file__).parent / f"{name}.usdc"))
-    return layer.documentation.partition("\n")[0].partition(": ")[2]
+    line = layer.documentation.partition("\n")[0].partition(": ")[2]
+    return line[0].upper() + line[1:]
 
 
 def film_scene(name: str) -> None:

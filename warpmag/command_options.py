@@ -16,6 +16,10 @@ from warpmag.terminal import log
 VIEWERS = {"gl": "ViewerGL", "viser": "ViewerViser", "rerun": "ViewerRerun"}
 """Viewers of ``newton.viewer`` by the value of ``--viewer``."""
 _DEVICE = "Warp device, cpu or cuda:0 (default: the first GPU, else cpu)"
+_CONTACT_MODEL = (
+    "model of balls that nearly touch (default: the stage's, else dipole, which underestimates the attraction of two "
+    "balls in line with the field by 34 %% at a gap of 0.3 radii and by 93 %% at 0.01)"
+)
 _STAGE = "a USD file, or a bundled scene (see 'warpmag scenes')"
 _RUN_EXAMPLES = """
   warpmag run balls_up                      simulate a bundled scene, write warpmag_out/balls_up.usda
@@ -139,7 +143,7 @@ def _add_run(run: argparse.ArgumentParser) -> None:
     add("--preset", choices=PRESETS, help=text)
     add("--force", choices=FORCES, help="force law (default: the stage's)")
     add("--dynamics", choices=DYNAMICS, help="magnetization dynamics (default: the stage's)")
-    add("--contact-model", choices=CONTACT_MODELS, help="model of balls that nearly touch (default: the stage's)")
+    add("--contact-model", choices=CONTACT_MODELS, help=_CONTACT_MODEL)
     names = f"{{{','.join(METHODS)}}}"
     text = "summation by the faster method, over all pairs, or by multipoles (default: %(default)s)"
     add("--method", action=_Method, default=METHODS[0], metavar=names, help=text)

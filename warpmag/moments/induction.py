@@ -188,7 +188,8 @@ def solve_induction(
         dynamics: ``theta``: accelerated exact flow of Eqs. 8 and 9. ``theta-euler``: their explicit step. ``llg``,
             ``llg-damping``: Eq. 6 with and without precession.
         contact_model: ``dipole``; ``multipole`` adds the higher multipoles of balls that nearly touch, from the exact
-            solution of two balls (see ``warpmag.kernels.near_contact``).
+            solution of two balls (see ``warpmag.kernels.near_contact``). With ``dipole`` two balls in line with the
+            field attract too weakly: by 34 % at a gap of 0.3 radii, by 93 % at 0.01.
         method: Summation of fields: ``direct``, over all pairs; ``fmm``, the fast multipole method with errors that
             ``rtol`` allows; ``auto``, the faster of the two.
         rtol: Relative error of the magnetizations at which the solve ends.

@@ -98,7 +98,8 @@ class Magnetics:
             dynamics: ``theta`` (exact flow, accelerated), ``theta-euler`` (the paper's explicit step), ``llg`` or
                 ``llg-damping`` (Eq. 6, with and without precession).
             contact_model: ``dipole``, or ``multipole``, which adds higher multipoles of balls that nearly touch each
-                other or flat faces of iron.
+                other or flat faces of iron. With ``dipole`` two balls in line with the field attract too weakly: by
+                34 % at a gap of 0.3 radii, by 93 % at 0.01.
             method: Summation of fields and forces: ``direct`` over all pairs, ``fmm`` by the fast multipole method
                 with an error within ``rtol``, or ``auto`` for the faster one.
             rtol: Relative magnetization error at which the induction solve ends.
