@@ -15,7 +15,7 @@ from bench.reference.oracle import MU0
 from warpmag.shapes import demagnetization, lattice
 from warpmag.shapes.face_charges import face_response
 from warpmag.shapes.softening import softened
-from warpmag.shapes.uniform_response import _cell_matrix
+from warpmag.shapes.uniform_response import cell_matrix
 
 REMANENCE = 1.3  # T
 PLATE = Body("box", (0.03, 0.03, 0.0015), (0.0, 0.0, -0.0015))
@@ -109,7 +109,7 @@ def test_softer_cells_keep_the_energy_of_uniform_magnetization(solid):
     """The operator stays positive, and its largest eigenvalue falls. Pairs beyond the list are left out: 3 %."""
     body = lattice.fill(solid, 0.0, lattice.LEAST_ACROSS, together=True)
     stiff = demagnetization.coupling(body, body.radii)
-    before, after = (_cell_matrix(coupling, body) for coupling in (stiff, softened(stiff, body)))
+    before, after = (cell_matrix(coupling, body) for coupling in (stiff, softened(stiff, body)))
     for axis in np.eye(3):
         uniform = np.outer(np.sqrt(body.volumes), axis).ravel()
         np.testing.assert_allclose(uniform @ after @ uniform, uniform @ before @ uniform, rtol=0.03)

@@ -85,6 +85,7 @@ class CellCouplings:
     Attributes:
         rotations: Rotation from each body's frame to the world, shape [bodies]; written by the caller.
         entries: Pairs of cells per evaluation.
+        chunks: First moment, count, first row of the body and first row of its table of each chunk of cells.
     """
 
     def __init__(self, bodies, moments, h, collective=None):
@@ -93,6 +94,7 @@ class CellCouplings:
         self._couplings = c = couplings_type(dtype)()
         c.moments, c.h = moments, h
         other_chunks = self._lay_out(bodies, collective, dtype, h.device)
+        self.chunks = c.chunk
         self.rotations, self.entries = c.rotation, sum(len(coupling.other) for _, coupling in bodies)
         self._launches, self._others = self._record_field(c), []
         if other_chunks:

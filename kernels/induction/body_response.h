@@ -2,8 +2,8 @@
 // body_response.py has the equations.
 //
 // On a GPU a block of threads works on a body, and a group of threads on a cell. On a CPU a thread works on a body,
-// with its cells in vectors. Takes MOST_CELLS and the constants of theta_flow.h; ``Bodies`` is the struct of
-// body_response.py.
+// with its cells in vectors. Takes MOST_CELLS, COMPONENTS and the constants of theta_flow.h; ``Bodies`` is the struct
+// of body_response.py.
 #pragma once
 #include "cells/rotation.h"
 #include "induction/theta_flow.h"
@@ -12,7 +12,6 @@ namespace warpmag {
 
 constexpr int MOST_STEPS = 24;     // of conjugate gradients
 constexpr double TOLERANCE = 0.05; // relative residual at which one more step suffices
-constexpr int COMPONENTS = 6;      // of a symmetric tensor: xx, yy, zz, xy, xz, yz
 
 #if defined(__CUDA_ARCH__)
 constexpr int VECTORS = 1;
@@ -60,8 +59,15 @@ CUDA_CALLABLE inline Vector sum_cells(const InducibleBody& body, const Real* tab
     for (int j = share(); j < end; j += SHARES) {
         const Real* const t = rows + (size_t)j * (COMPONENTS * CHUNK);
         const Real x = body.vectors[j], y = body.vectors[MOST_CELLS + j], z = body.vectors[2 * MOST_CELLS + j];
-        const Number xx = numbers(t), yy = numbers(t + CHUNK), zz = numbers(t + 2 * CHUNK);
-        const Number xy = numbers(t + 3 * CHUNK), xz = numbers(t + 4 * CHUNK), yz = numbers(t + 5 * CHUNK);
+        auto component = [=](int c) { return numbers(t + c * CHUNK); };
+        if constexpr (COMPONENTS == 9) {
+            h += Vector{component(0) * x + component(1) * y + component(2) * z,
+                        component(3) * x + component(4) * y + component(5) * z,
+                        component(6) * x + component(7) * y + component(8) * z};
+            continue;
+        }
+        const Number xx = component(0), yy = component(1), zz = component(2);
+        const Number xy = component(3), xz = component(4), yz = component(5);
         h += Vector{xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z};
     }
     return group_sums(h);

@@ -20,8 +20,8 @@ A warm start extrapolates the field of everything outside a body, with neighbors
 response is solved for in the present rotation.
 
 Tables hold, for each shape, tensors T_ij [1/m³] between all of its cells. The full tensors come first, then the tensors
-of the pair law, which the sums over pairs contain. For each chunk of ``CHUNK`` cells and each cell j there are rows xx,
-yy, zz, xy, xz, yz of ``CHUNK`` numbers.
+of the pair law, which the sums over pairs contain. For each chunk of ``CHUNK`` cells and each cell j there are rows of
+``CHUNK`` numbers: xx, yy, zz, xy, xz, yz of symmetric tensors, or xx, xy, xz, yx, ..., if those of any body are not.
 """
 
 from dataclasses import dataclass
@@ -40,6 +40,7 @@ MOST_CELLS = 64
 """Most cells of a body with a collective response: work grows as the square, and a GPU's block has few threads."""
 _GROUP = 4  # threads of a GPU that share a cell
 _BODIES_PER_THREAD = 8  # fewest bodies per thread of a CPU
+_ROWS_OF_SYMMETRIC = [0, 3, 4, 3, 1, 5, 4, 5, 2]  # all nine components among the six of a symmetric tensor
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class RespondingBody:
     first: int  # its first moment
     world: int  # its world
     number: int  # index of its rotation
-    tensors: np.ndarray  # tensors between its n cells, full ones and those of the pair law [1/m³], shape [2, n, n, 6]
+    tensors: np.ndarray  # between its n cells, full ones and those of the pair law [1/m³], shape [2, n, n, 6 or 9]
 
     @property
     def cell_count(self) -> int:
@@ -75,21 +76,21 @@ def responses_type(dtype):
 
 
 @cache
-def _kernel(dtype, group: int):
+def _kernel(dtype, group: int, components: int):
     call = "respond_all(thread, begin == 1, threads, team.data, bodies, state)"
     arguments = {"begin": int, "threads": int, "team": wp.array2d[wp.uint64]}
     arguments |= {"bodies": responses_type(dtype), "state": state_type(dtype)}
     constants = {"GROUP": group, "CAPACITY": CAPACITY, "DEPTH": DEPTH, "INVERSE_4PI": INVERSE_4PI}
-    constants |= {"MOST_CELLS": MOST_CELLS, "RESPONDING": 1}
+    constants |= {"MOST_CELLS": MOST_CELLS, "RESPONDING": 1, "COMPONENTS": components}
     return native_kernel(call, "induction/body_response.h", arguments, dtype=dtype, **constants)
 
 
-def _table(tensors: np.ndarray) -> np.ndarray:
-    """Return tensors of a shape, shape [n, n, 6], in chunks of cells side by side, flat."""
+def _table(tensors: np.ndarray, components: int) -> np.ndarray:
+    """Return tensors of a shape, shape [n, n, 6 or 9], in chunks of cells side by side, flat."""
     count = len(tensors)
-    padded = np.zeros((-(-count // CHUNK) * CHUNK, count, 6))
-    padded[:count] = tensors
-    return padded.reshape(-1, CHUNK, count, 6).transpose(0, 2, 3, 1).reshape(-1)
+    padded = np.zeros((-(-count // CHUNK) * CHUNK, count, components))
+    padded[:count] = tensors if tensors.shape[2] == components else tensors[:, :, _ROWS_OF_SYMMETRIC]
+    return padded.reshape(-1, CHUNK, count, components).transpose(0, 2, 3, 1).reshape(-1)
 
 
 class BodyResponses:
@@ -109,10 +110,11 @@ class BodyResponses:
         dtype, device = state.packed.dtype, state.h.device
         self._bodies = b = responses_type(dtype)()
         tables, begin, size = [], {}, 0
+        self._components = components = max(body.tensors.shape[3] for body in bodies)
         for body in bodies:
             if id(body.tensors) not in begin:
                 begin[id(body.tensors)] = size
-                tables += [_table(tensors) for tensors in body.tensors]
+                tables += [_table(tensors, components) for tensors in body.tensors]
                 size += 2 * len(tables[-1])
 
         def put(values, kind):
@@ -120,7 +122,7 @@ class BodyResponses:
 
         b.body = put([(body.first, body.cell_count, body.world, body.number) for body in bodies], wp.vec4i)
         b.table = put([begin[id(body.tensors)] for body in bodies], wp.int32)
-        b.pair_law = put([len(_table(body.tensors[0])) for body in bodies], wp.int32)
+        b.pair_law = put([len(_table(body.tensors[0], components)) for body in bodies], wp.int32)
         b.tensor, b.rotation = put(np.concatenate(tables), dtype), rotations
         b.past = wp.zeros((2, len(bodies)), dtype=wp.types.quaternion(dtype), device=device)
         self.cell_count = sum(body.cell_count for body in bodies)
@@ -131,10 +133,15 @@ class BodyResponses:
     def _record(self, state, begin: int, bodies: list[RespondingBody]):
         device, dtype, count = state.h.device, state.packed.dtype, len(bodies)
         if device.is_cpu:
-            kernel, block, dim, threads = _kernel(dtype, 1), 256, 1, threads_for(count, _BODIES_PER_THREAD)
+            kernel, block, dim, threads = (
+                _kernel(dtype, 1, self._components),
+                256,
+                1,
+                threads_for(count, _BODIES_PER_THREAD),
+            )
         else:
             block = -(-_GROUP * max(body.cell_count for body in bodies) // 32) * 32
-            kernel, dim, threads = _kernel(dtype, _GROUP), block * count, 0
+            kernel, dim, threads = _kernel(dtype, _GROUP, self._components), block * count, 0
         inputs = [begin, threads, team() if device.is_cpu else None, self._bodies, state]
         return wp.launch(kernel, dim=dim, inputs=inputs, block_dim=block, device=device, record_cmd=True)
 

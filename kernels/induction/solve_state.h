@@ -8,12 +8,13 @@ namespace warpmag {
 constexpr int STEADY = 3; // consecutive solves that give two changes, enough to extrapolate
 enum Next { NOTHING, DEMAGNETIZE, STEP_FROM_BEST, STEP, STEP_AND_SWEEP }; // next action of a world
 
-// Starts the iteration of a world.
+// Starts the iteration of a world, unless it rests.
 template <class State> CUDA_CALLABLE inline void begin_world(State& state, int w) {
     auto& world = state.worlds.data[w];
-    world.active = state.condition.data[0] = 1;
+    world.active = !state.resting.data[w];
+    if (world.active) state.condition.data[0] = 1;
     world.evaluations = world.has_change = world.plain_steps = 0;
-    world.next = state.warm.data[w] == STEADY ? STEP_AND_SWEEP : NOTHING;
+    world.next = world.active && state.warm.data[w] == STEADY ? STEP_AND_SWEEP : NOTHING;
     world.best = -1.0, world.damping = 1.0;
     if (state.warm.data[w] == 0) world.change_count = 0, world.slowness = 0.0;
 }

@@ -89,6 +89,7 @@ def state_type(dtype):
         sums: wp.array2d[wp.float64]  # sums of each chunk, on a CPU of each vector, shape [c, COLUMNS]
         arrived: wp.array[int]  # number of each world's chunks whose sums are complete, shape [w]
         worlds: wp.array[World]  # state of each world, shape [w]
+        resting: wp.array[int]  # 1 for worlds that solves leave out, shape [w]
         warm: wp.array[int]  # number of solves of each world since its cold start, at most ``STEADY``, shape [w]
         residual: wp.array[wp.float64]  # ‖M − f(H)‖/‖f(H)‖ of each world after its last evaluation, shape [w]
         error: wp.array[wp.float64]  # estimate of ``theta_flow``, or residual of a baseline, relative, shape [w]
@@ -138,7 +139,7 @@ def allocate(worlds, inducible, dtype, device):
         **zeros("sums", (count * vectors, COLUMNS), wp.float64),
         **zeros("worlds", world_count, World),
         **zeros("residual error", world_count, wp.float64),
-        **zeros("arrived warm evaluations", world_count),
+        **zeros("arrived resting warm evaluations", world_count),
         **zeros("responds", n),
         **zeros("condition", 1),
     }
@@ -151,7 +152,7 @@ def allocate(worlds, inducible, dtype, device):
 def persistent_arrays(state) -> dict:
     """Return the arrays of a state that persist from one solve to the next, by name."""
     names = "near near_count s iterate_s iterate_r history_s history_r best_s best_r mixed_g mixed_moment past_field"
-    names += " past_g past now swept worlds warm residual error evaluations converged"
+    names += " past_g past now swept worlds resting warm residual error evaluations converged"
     return {name: getattr(state, name) for name in names.split()}
 
 

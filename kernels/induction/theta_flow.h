@@ -202,6 +202,7 @@ CUDA_CALLABLE inline Vector extrapolated_field(const State& state, const Span& a
 
 // Starts a solve: writes step lengths, and first moments from the applied field and the last solutions.
 template <class State> CUDA_CALLABLE inline void start(State& state, const Span& at) {
+    if (state.resting.data[at.world]) return;
     auto& world = state.worlds.data[at.world];
     const int warm = state.warm.data[at.world];
     const Real ahead = (Real)world.ahead;

@@ -70,6 +70,7 @@ class PairEvaluation:
         form: ``LOOP``, ``FUSED``, ``MIRRORED``, ``REFERENCE`` or ``GIVEN``.
         count: Number of target rows.
         target: Packed column of each target row, shape [count].
+        tiles: Work list on the device (``work_list``), shape [tiles, TILE_COLUMNS].
         pair_count: Number of pairs of a target and a source.
         partial: Partial sums, shape [parts, rows, sums]; the caller's ``extra_parts`` are last.
     """
@@ -95,7 +96,7 @@ class PairEvaluation:
         shape = parts + extra_parts, max(self.count, 1), WIDTHS[quantity]
         self.partial = a.partial = (wp.zeros if extra_parts else wp.empty)(shape, dtype=dtype, device=device)
         self._summed = self.partial[:parts] if self._ranks is not None else None
-        a.tiles = wp.array(np.reshape(tiles, (-1, work_list.TILE_COLUMNS)), dtype=wp.int32, device=device)
+        self.tiles = a.tiles = wp.array(np.reshape(tiles, (-1, work_list.TILE_COLUMNS)), dtype=wp.int32, device=device)
         a.targets, a.sources, a.same_set = targets.packed, sources.packed, int(targets is sources)
         a.overlap, a.overlap_count = targets.overlaps, targets.overlap_counts
         a.effective = targets.moments if effective is None else effective

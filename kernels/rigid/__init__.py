@@ -4,6 +4,7 @@
 |---|---|
 | newton_views | structs of Newton's arrays of bodies and contacts |
 | bodies | positions and moments of magnets from their bodies, wrenches on the bodies |
+| distant | bodies of iron with few moments: the choice by worlds, and the cells |
 | sources | frames and motion of coils and field maps, wrenches on their bodies; readings at sites |
 | keys, keyed_poses | time-sampled values, and poses of kinematic bodies that follow them |
 | monitor | largest motion, penetration, buffer use and induction error of a substep |

@@ -32,7 +32,9 @@ class BodyMoments:
     shape_frames: wp.array[wp.transform]  # frame of each shape in its body, an array of the model, shape [shapes]
     magnetizations: wp.array[wp.vec3]  # permanent magnetization in the shape's frame [A/m], likewise
     body_list: wp.array[wp.int32]  # bodies with moments, shape [b]
-    body_run_start: wp.array[wp.int32]  # first run of each of them, shape [b + 1]
+    body_world: wp.array[wp.int32]  # world of each of them, shape [b]
+    resting: wp.array[wp.int32]  # 1 for worlds where the moments exert no forces, shape [worlds]
+    body_run_start: wp.array[wp.int32]  # first run of each body with moments, shape [b + 1]
     runs: wp.array[wp.vec2i]  # first moment of each run, and the index after its last, shape [r]
     kinematic_flag: int  # Newton's flag of bodies that forces do not move
 
@@ -200,7 +202,7 @@ def _add_wrenches(
     k = wp.tid() // threads
     thread = wp.tid() % threads
     body = magnets.body_list[k]
-    if (body_flags_in[body] & magnets.kinematic_flag) != 0:
+    if (body_flags_in[body] & magnets.kinematic_flag) != 0 or magnets.resting[magnets.body_world[k]] != 0:
         return
     center = wp.transform_point(body_q_in[body], body_com_in[body])
     partial = wp.spatial_vectord()
@@ -219,7 +221,7 @@ def _add_wrenches(
 
 
 def add_wrenches(magnets: BodyMoments, model, state, positions, forces, torques):
-    """Add the force and torque of every moment to the wrench of its body in ``state``, except for kinematic bodies."""
+    """Add force and torque of every moment to its body in ``state``, but for kinematic bodies and resting worlds."""
     device = positions.device
     threads = _THREADS if device.is_cuda else 1
     inputs = [magnets, state.body_q, model.body_com, model.body_flags, positions, forces, torques, threads]

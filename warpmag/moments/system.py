@@ -76,6 +76,8 @@ class MomentSystem:
         external_field: Applied field [A/m], shape [n]; the caller may change it.
         crowded: 1 if some cells have too many neighbors in other bodies, so that they act as balls, shape [1]; None
             unless a world has several bodies of ``couplings``.
+        resting: 1 for worlds that :meth:`solve` leaves out, with their moments as they are, shape [worlds]; only the
+            dynamics ``theta`` has them. The caller may write it.
         rotations: Rotation of each body of ``couplings`` from its frame to the world's (x, y, z, w), shape [bodies];
             written by the caller before :meth:`solve`. None without ``couplings``.
         sources: ``sources`` and ``solids`` on the device; the caller writes their poses and strengths before
@@ -166,9 +168,9 @@ class MomentSystem:
         radii, most = wp.array(layout.radii, dtype=self.dtype, device=self.device), layout.radii.max(initial=0.0)
         self._packed = PackedMoments(radii, largest_radius=float(most), labels=layout.bodies, groups=layout.worlds)
         self._effective = self._packed.vectors()
-        self._induction = solve_state.allocate(layout.worlds, ~layout.permanent, self.dtype, self.device)
-        self.h, self.residual, self.error = self._induction.h, self._induction.residual, self._induction.error
-        self.evaluations, self.converged = self._induction.evaluations, self._induction.converged
+        self._induction = state = solve_state.allocate(layout.worlds, ~layout.permanent, self.dtype, self.device)
+        self.h, self.residual, self.error, self.resting = state.h, state.residual, state.error, state.resting
+        self.evaluations, self.converged = state.evaluations, state.converged
 
     def _make_bias(self, layout: MomentLayout) -> MomentLayout:
         """Allocate the bias of moments with recoil permeability, which are not aligned in the returned layout."""
@@ -219,7 +221,7 @@ class MomentSystem:
         self._couplings = couplings
         if couplings:
             collective = [responses and len(coupling.radii) <= MOST_CELLS for _, coupling in couplings]
-            takes_part = [first not in closed_forms for first, _ in couplings]
+            takes_part = [coupling.near and first not in closed_forms for first, coupling in couplings]
             several = np.bincount(layout.worlds[[first for first, _ in couplings]], takes_part).max() > 1
             if several:
                 # lone bodies are corrected: touching cubes would pull 9 % too much by common fields, 30 % if softened
@@ -240,7 +242,7 @@ class MomentSystem:
         """Let permanent bodies act on the cells near them by averages; ``closed_forms`` as in :meth:`_make_cells`."""
         bodies: list[NearCellBody | None] = [None] * len(couplings)
         for number, (first, coupling) in enumerate(couplings):
-            if first not in closed_forms:
+            if coupling.near and first not in closed_forms:
                 response = face_response(tuple(coupling.cell_sides), FACE_SPLIT)
                 bodies[number] = NearCellBody(first, coupling, response, float(susceptibility[first]))
         if any(bodies):

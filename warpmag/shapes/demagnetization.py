@@ -68,6 +68,9 @@ class Coupling:
     cell_sides: np.ndarray  # sides of a whole cell [m], frame of the grid, shape [3]
     grid_rotation: np.ndarray  # from the frame of the grid to that of the body (x, y, z, w), shape [4]
 
+    near = True
+    """True if the moments are cells, whose fields nearby are not those of balls."""
+
     @cached_property
     def center(self) -> np.ndarray:
         """Mean of the positions [m], shape [3]."""
@@ -94,14 +97,20 @@ class Coupling:
 
         Valid for uniform common fields only: with linear fields the tensors are not symmetric.
         """
-        n = len(self.radii)
-        i, j = np.divmod(np.arange(n * n), n)
-        law = _pair_law(self.positions[i] - self.positions[j], self.radii[i], self.radii[j], i == j)
-        law[i == j] = 0.0  # the magnetization curve contains a ball's own field
-        corrected = law.reshape(n, n, 6).copy()
+        n, law = len(self.radii), pair_law_tensors(self.positions, self.radii)
+        corrected = law.copy()
         corrected[np.repeat(np.arange(n), np.diff(self.start)), self.other] += self.tensor
         corrected += self.common[COMPONENTS]
-        return np.stack([corrected, law.reshape(n, n, 6)])
+        return np.stack([corrected, law])
+
+
+def pair_law_tensors(positions: np.ndarray, radii: np.ndarray) -> np.ndarray:
+    """Return the tensors of the sums over pairs between n balls [1/m³], 0 for a ball itself, shape [n, n, 6]."""
+    n = len(radii)
+    i, j = np.divmod(np.arange(n * n), n)
+    law = _pair_law(positions[i] - positions[j], radii[i], radii[j], i == j)
+    law[i == j] = 0.0  # the magnetization curve contains a ball's own field
+    return law.reshape(n, n, 6)
 
 
 def cuboid_tensors(offsets: np.ndarray, sides: np.ndarray) -> np.ndarray:

@@ -188,7 +188,7 @@ def cell_polarizability(coupling: Coupling, lattice: Lattice) -> np.ndarray:
     fields = root * common_fields(coupling.scaled_positions)[:, :, : _field_count(coupling)]
     if len(fields) <= _MATRIX_CELLS:
         columns = fields.reshape(3 * len(fields), -1)
-        moments = columns.T @ np.linalg.solve(_cell_matrix(coupling, lattice), columns)
+        moments = columns.T @ np.linalg.solve(cell_matrix(coupling, lattice), columns)
     else:
         solution, residual = _conjugate_gradients(_cell_operator(coupling, lattice), fields)
         moments = np.einsum("nkl,nkm->lm", solution, fields + residual)  # second order in the residual
@@ -236,7 +236,7 @@ def _cell_operator(coupling: Coupling, lattice: Lattice):
     return apply
 
 
-def _cell_matrix(coupling: Coupling, lattice: Lattice) -> np.ndarray:
+def cell_matrix(coupling: Coupling, lattice: Lattice) -> np.ndarray:
     """Return the operator of :func:`_cell_operator` as a matrix, shape [3 n, 3 n]."""
     x, root, isotropic, dipolar, unit = pair_factors(coupling, lattice)
     n, tensors = len(x), full_tensors(coupling.tensor) * unit**3

@@ -15,23 +15,18 @@ from warpmag.declarations.magnets import MagneticSettings, check_magnetization
 from warpmag.deprecation import renamed_arguments
 from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.caller_checks import check_duration, check_state, held_by_model
+from warpmag.engine.magnets.distant_magnets import DistantMagnets, distant_bodies
 from warpmag.engine.magnets.eddy import gather_velocities, set_conductivities
 from warpmag.engine.magnets.grouping import BodyMagnet, find_magnets
 from warpmag.engine.magnets.imported_field import imported_field
-from warpmag.engine.magnets.magnet_system import KINEMATIC, make_system
 from warpmag.engine.magnets.model_values import ModelValues, magnetic_arrays
+from warpmag.engine.magnets.placed_moments import PlacedMoments
 from warpmag.engine.magnets.pose_gradients import ForceGradients
 from warpmag.engine.magnets.sources import ModelSources
 from warpmag.engine.magnets.workload import Workload, workload
 from warpmag.engine.magnets.world_reset import WorldMask, WorldRows
 from warpmag.errors import ConvergenceWarning, InputError, warn_caller
 from warpmag.kernels.rigid.bodies import (
-    BodyMoments,
-    add_wrenches,
-    gather_bias,
-    gather_frames,
-    gather_moments,
-    gather_rotations,
     set_external_field,
     set_magnetization,
     sum_moments,
@@ -48,6 +43,7 @@ from warpmag.moments.arrays import (
 )
 from warpmag.moments.probe import FieldProbe
 from warpmag.moments.ranks import current_ranks
+from warpmag.moments.system import MomentSystem
 from warpmag.moments.tape import check_untaped, paused_tape
 from warpmag.terminal import collection_paused
 
@@ -55,8 +51,9 @@ from warpmag.terminal import collection_paused
 class Magnetics:
     """The magnets of a Newton model: their induction, forces and fields.
 
-    A ball is one moment. Any other shape is a lattice of moments with the exact volume. Moments of one body exert no
-    forces on each other, and magnets of different worlds do not interact. Use any solver that reads ``State.body_f``::
+    A ball is one moment. Any other shape is a lattice of moments with the exact volume, or few moments in its place
+    where every other magnet is far from it. Moments of one body exert no forces on each other, and magnets of different
+    worlds do not interact. Use any solver that reads ``State.body_f``::
 
         magnetics = warpmag.Magnetics(model)
         ...
@@ -66,7 +63,8 @@ class Magnetics:
 
     Attributes:
         magnets: The magnets, in the order of their moments.
-        system: The moments on the device.
+        system: The moments on the device. Where bodies act by few moments, its own are those of the last
+            :meth:`sum_moments` or measurement.
         shapes: Indices of the magnetic shapes, in the order of :meth:`shape_moments`, shape [n].
         shape_volumes: Magnetic volume of each of these shapes [m³], shape [n]. Where shapes of one body overlap, the
             common volume belongs to the first of them.
@@ -130,21 +128,26 @@ class Magnetics:
         self._model, self._values = model, ModelValues(model, measured=isinstance(curve, MagnetizationCurve))
         self._sources = ModelSources(model, self._worlds)
         self._induced = False
-        self.system, coupled_bodies, solid_bodies = make_system(
-            model, self.magnets, settings, sources=self._sources.applied, curve=curve,
-            method=method, max_evaluations=max_evaluations,
-        )  # fmt: skip
-        self._coupled_bodies, self._solid_bodies = (
-            wp.array(bodies, dtype=wp.int32, device=model.device) for bodies in (coupled_bodies, solid_bodies)
-        )
+        options = {"sources": self._sources.applied, "curve": curve, "method": method}
+        options["max_evaluations"] = max_evaluations
+        self._placed = placed = PlacedMoments(model, self.magnets, settings, **options)
+        self.system, self._distant = placed.system, None
+        bodies = distant_bodies(model, self.magnets, settings, method=method, has_sources=bool(self._sources.applied))
+        if bodies:
+            self._distant = DistantMagnets(model, placed, bodies, settings, **options)
         self._sources.bind(self.system)
         self.coils = self._sources.circuits
-        self._map_bodies()
-        self._gradients = ForceGradients(self.system, self._body_moments, self._sources, model, self._coupled_bodies)
+        self._map_shapes()
+        self._gradients = ForceGradients(self.system, placed.table, self._sources, model, placed.coupled_bodies)
         self._prepare_reset()
         set_conductivities(model, self.magnets, self.system, float(dt))
         if imported is not None:
             self.set_external_field(imported)
+
+    @property
+    def _systems(self) -> list[MomentSystem]:
+        """The system, and that with few moments in place of cells."""
+        return [self.system] if self._distant is None else [self.system, self._distant.few.system]
 
     @property
     def device(self) -> wp.Device:
@@ -209,50 +212,25 @@ class Magnetics:
             held.check()
         check_state(state, self._model, *names, *(("body_qd",) if self.needs_velocities else ()))
 
-    def _map_bodies(self) -> None:
-        """Copy the moments of each body and each shape to the device."""
-        device = self._model.device
-        lattices, magnets = [magnet.lattice for magnet in self.magnets], [magnet.magnet for magnet in self.magnets]
-        counts = [len(lattice.volumes) for lattice in lattices]
-        run_body = np.array([magnet.body for magnet in self.magnets])
-        body, fixed = np.repeat(run_body, counts), np.repeat([magnet.fixed for magnet in magnets], counts)
-        self._volumes = np.concatenate([lattice.volumes for lattice in lattices])
+    def _map_shapes(self) -> None:
+        """Copy the moments of each shape, and the permanent shapes of each body, to the device."""
+        device, volumes = self._model.device, self._placed.volumes
         self.shapes = np.concatenate([magnet.shapes for magnet in self.magnets])
-        shape_counts = np.concatenate([lattice.counts for lattice in lattices])
+        counts = np.concatenate([magnet.lattice.counts for magnet in self.magnets])
+        self._first_moments = np.concatenate([[0], np.cumsum(counts)])
+        self.shape_volumes = np.diff(np.concatenate([[0.0], np.cumsum(volumes)])[self._first_moments])
 
-        start = np.concatenate([[0], np.cumsum(counts)])
-        order = np.argsort(run_body, kind="stable")
-        bodies, first = np.unique(run_body[order], return_index=True)
-        dynamic = bodies >= 0
+        def put(values):
+            return wp.array(np.ascontiguousarray(values), dtype=wp.int32, device=device)
 
-        def put(values, dtype):
-            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
-
-        self._body_moments = moments = BodyMoments()
-        moments.body, moments.permanent = put(body, wp.int32), put(fixed, wp.bool)
-        moments.local_positions = put(np.concatenate([lattice.positions for lattice in lattices]), wp.vec3)
-        moments.volumes, moments.shape = put(self._volumes, float), put(np.repeat(self.shapes, shape_counts), wp.int32)
-        moments.shape_frames = self._model.shape_transform
-        moments.magnetizations = getattr(self._model, NAMESPACE).magnetization
-        susceptibility = np.repeat([magnet.recoil_permeability - 1.0 for magnet in magnets], counts)
-        recoiling = np.flatnonzero(np.repeat([magnet.recoils for magnet in magnets], counts))
-        self._recoiling, self._bias_factors = put(recoiling, wp.int32), put(1.0 / susceptibility[recoiling], float)
-        moments.body_list = put(bodies[dynamic], wp.int32)
-        moments.body_run_start = put(np.append(first[dynamic], len(order)), wp.int32)
-        moments.runs = put(np.stack([start[:-1], start[1:]], axis=1)[order], wp.vec2i)
-        moments.kinematic_flag = KINEMATIC
-
-        self._first_moments = np.concatenate([[0], np.cumsum(shape_counts)])
-        volume = np.concatenate([[0.0], np.cumsum(self._volumes)])
-        self.shape_volumes = np.diff(volume[self._first_moments])
-        self._first_moments_on_device = put(self._first_moments, wp.int32)
+        self._first_moments_on_device = put(self._first_moments)
         self._shape_totals = wp.zeros(len(self.shapes), dtype=wp.vec3, device=device)
-        self._newton_world = put(np.maximum(self._worlds, 0)[self.system.worlds], wp.int32)
+        self._newton_world = put(np.maximum(self._worlds, 0)[self.system.worlds])
         permanent = [magnet.magnet.kind == "permanent" for magnet in self.magnets for _ in magnet.shapes]
         shape_body = self._model.shape_body.numpy()
         shapes = self.shapes[np.array(permanent)]
         shapes = shapes[np.argsort(shape_body[shapes], kind="stable")]
-        self._permanent_shapes, self._permanent_list = shapes, put(shapes, wp.int32)
+        self._permanent_shapes, self._permanent_list = shapes, put(shapes)
         self._permanent_bodies = shape_body[shapes]
 
     def _prepare_reset(self) -> None:
@@ -293,7 +271,8 @@ class Magnetics:
         if self.coils is not None:
             self.coils.reset(self._mask)
         choose(self._mask.array, self._system_worlds, self._chosen_worlds)
-        self.system.start_cold(self._chosen_worlds)
+        for system in self._systems:
+            system.start_cold(self._chosen_worlds)
 
     def apply(self, state: newton.State, dt: float | None = None) -> None:
         """Add the magnetic forces at the poses of ``state`` to ``state.body_f``; capturable in a graph.
@@ -322,7 +301,7 @@ class Magnetics:
         with paused_tape() as tape:
             if tape is not None and self.coils is not None and state.body_q.requires_grad:
                 raise InputError(f"apply: forces with the voltage of {self.coils.labels[0]} have no gradient")
-            self.induce(state, dt)
+            self._solve(state, dt, taped=tape is not None and bool(self._gradients.arguments(state)))
             self.add_forces(state)
             if tape is not None:
                 self._gradients.record(tape, state)
@@ -340,25 +319,22 @@ class Magnetics:
         Raises:
             InputError: An argument has another type, size or device than it must have, or ``dt`` is not positive.
         """
+        self._solve(state, dt, sharing)
+
+    def _solve(self, state: newton.State, dt: float | None, sharing=None, *, taped: bool = False) -> None:
+        """Solve the induction, see :meth:`induce`; if ``taped``, with the moments that gradients know."""
         values, system = self._values, self.system
         check_duration(dt, sharing, self._model.device)
         self._check_state(state, "body_q")
         check_untaped(self._gradients.arguments(state), "only Magnetics.apply records one")
         self._induced = True
-        gather_moments(
-            *(state.body_q, self._body_moments, values.present, values.used, system.positions, system.moments),
-            values.changed,
-        )
+        self._placed.gather(state.body_q, values)
         values.check(wait=False)
-        if system.rotations is not None:
-            gather_rotations(state.body_q, self._coupled_bodies, system.rotations)
         self._sources.gather(state.body_q)
-        if len(self._solid_bodies):
-            gather_frames(state.body_q, self._solid_bodies, system.sources.solid_frames)
-        if len(self._recoiling):
-            gather_bias(state.body_q, self._body_moments, self._recoiling, self._bias_factors, system.bias)
-        gather_velocities(self._model, state, self._body_moments, self._sources, system)
-        if self.coils is None or dt is None:
+        gather_velocities(self._model, state, self._placed.table, self._sources, system)
+        if self._distant is not None:
+            self._distant.solve(state.body_q, values, allowed=not taped)
+        elif self.coils is None or dt is None:
             system.solve()
         else:
             self.coils.step(float(dt), sharing)
@@ -366,9 +342,11 @@ class Magnetics:
     def add_forces(self, state: newton.State) -> None:
         """Add the forces on the present moments to ``state.body_f``: the second half of :meth:`apply`."""
         self._check_state(state, "body_q", "body_f")
+        if self._distant is not None:
+            self._distant.add_forces(state)
+            return
         self.system.apply_forces()
-        system = self.system
-        add_wrenches(self._body_moments, self._model, state, system.positions, system.forces, system.torques)
+        self._placed.add_wrenches(self._model, state)
         self._sources.add_reactions(state)
 
     def notify_model_changed(self, flags: newton.ModelFlags | int = newton.ModelFlags.SHAPE_PROPERTIES) -> None:
@@ -387,11 +365,12 @@ class Magnetics:
         if not int(flags) & int(newton.ModelFlags.SHAPE_PROPERTIES):
             return
         changed = self._values.changed_materials()
-        moment_shapes = self._body_moments.shape.numpy()
-        affected = np.isin(moment_shapes, changed) & ~self._body_moments.permanent.numpy()
-        affected[self._recoiling.numpy()] = False
-        moments = np.flatnonzero(affected)
-        self.system.set_material(moments, *self._values.material(moment_shapes[moments]))
+        for placed in [self._placed] if self._distant is None else [self._placed, self._distant.few]:
+            moment_shapes = placed.table.shape.numpy()
+            affected = np.isin(moment_shapes, changed) & ~placed.table.permanent.numpy()
+            affected[placed.recoiling.numpy()] = False
+            moments = np.flatnonzero(affected)
+            placed.system.set_material(moments, *self._values.material(moment_shapes[moments]))
         self.magnets = [self._with_material(magnet) for magnet in self.magnets]
         self._values.accept_changes()
 
@@ -403,12 +382,17 @@ class Magnetics:
 
     def persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays that the next step depends on, by name: values set by the user and the last solution."""
-        attributes, system = getattr(self._model, NAMESPACE), self.system
+        attributes = getattr(self._model, NAMESPACE)
         values = {"magnetization": attributes.magnetization, "strength": attributes.strength}
-        values["field"] = system.external_field
+        values["field"] = self.external_field
         if self.coils is not None:
             values |= {f"coils.{name}": array for name, array in self.coils.persistent_arrays().items()}
-        return values | self._values.persistent_arrays() | system.persistent_arrays()
+        return values | self._values.persistent_arrays() | self._solutions()
+
+    def _solutions(self) -> dict[str, wp.array]:
+        """Return the arrays that solves pass to the next ones, by name."""
+        few = {} if self._distant is None else self._distant.persistent_arrays()
+        return self.system.persistent_arrays() | {f"few.{name}": array for name, array in few.items()}
 
     def stepped_arrays(self) -> list[wp.array]:
         """Return the arrays that advance by ``dt`` in :meth:`induce`; restoring them repeats the step."""
@@ -495,7 +479,7 @@ class Magnetics:
         if not len(rows) or (shape is None and body < 0):
             raise InputError(f"set_magnetization: {'body' if shape is None else 'shape'} has no permanent magnet")
         shapes = self._permanent_list[int(rows[0]) : int(rows[-1]) + 1]
-        set_magnetization(self._vectors("magnetization", magnetization, (1,)), shapes, self._model, self._body_moments)
+        set_magnetization(self._vectors("magnetization", magnetization, (1,)), shapes, self._model, self._placed.table)
 
     def _vectors(self, name: str, value, counts: tuple[int, ...]) -> wp.array:
         """Return ``value`` as an array of vectors on the model's device; its length must be one of ``counts``."""
@@ -531,7 +515,8 @@ class Magnetics:
         context = CallContext(self.system.device, self.system.dtype, warp_out=False)
         points = context.vectors("points", points, farthest=largest_coordinate(self.system.dtype, largest))
         indices = self._world_indices(worlds, len(points))
-        probe = FieldProbe(self.system, len(points), worlds=indices, gradients=gradients)
+        prepare = None if self._distant is None else self._distant.spread_moments
+        probe = FieldProbe(self.system, len(points), worlds=indices, gradients=gradients, prepare=prepare)
         wp.copy(probe.points, points)
         return probe
 
@@ -576,7 +561,8 @@ class Magnetics:
         """Return the time of a step by part, body and world, with the moments and near cells of each body.
 
         Parts of the last solve are launched again on their own, on a GPU in graphs. The time of a body is estimated
-        from its share of moments, of pairs and of cells near permanent magnets. Results stay. Waits for the device::
+        from its share of moments, of pairs and of cells near permanent magnets. Bodies that act by few moments in all
+        worlds appear with these. Results stay. Waits for the device::
 
             magnetics.apply(state)
             print(magnetics.workload())
@@ -586,7 +572,8 @@ class Magnetics:
         """
         self._check_solved()
         self.check_model()
-        return workload(self)
+        rest = self._distant is not None and self._distant.rest_everywhere()
+        return workload(self, self._distant.few if rest else self._placed)
 
     def _check_solved(self) -> None:
         """Raise :class:`InputError` before the first solve, warn if the last one did not converge."""
@@ -610,7 +597,7 @@ class Magnetics:
         self._check_solved()
         self.check_model()
         energies = np.zeros(max(self._model.world_count, 1))
-        energies[np.maximum(self._worlds, 0)] = self.system.energy()
+        energies[np.maximum(self._worlds, 0)] = (self._distant or self.system).energy()
         return energies
 
     def shape_moments(self) -> np.ndarray:
@@ -624,6 +611,8 @@ class Magnetics:
 
     def sum_moments(self) -> wp.array:
         """Return :meth:`shape_moments` as a Warp array, which the next call overwrites; capturable in a graph."""
+        if self._distant is not None:
+            self._distant.spread_moments()
         sum_moments(self._first_moments_on_device, self.system.moments, self._shape_totals)
         return self._shape_totals
 
@@ -637,8 +626,8 @@ class Magnetics:
             Total moment of each magnetic shape [A·m²], world frame, shape [n, 3].
         """
         self._check_state(state, "body_q")
-        system, induced = self.system, self._induced
-        persistent, fields = system.persistent_arrays(), system.field_arrays()
+        systems, induced, persistent = self._systems, self._induced, self._solutions()
+        fields = [array for system in systems for array in system.field_arrays()]
         saved, saved_fields = take_snapshot(persistent), [wp.clone(array) for array in fields]
 
         def restore():
@@ -655,7 +644,8 @@ class Magnetics:
             restore()
             self._induced = induced
             if induced:
-                system.evaluate_again()
+                for system in systems:
+                    system.evaluate_again()
                 restore()
 
     def start_from(self, magnetizations: dict[int, np.ndarray]) -> None:
@@ -675,8 +665,8 @@ class Magnetics:
             if shape not in own_shapes:
                 raise InputError(f"magnetizations: shape {short_repr(shape)} has no magnet")
             check_vector(f"magnetizations: shape {shape}", magnetization)
-        start = np.zeros((len(self._volumes), 3))
-        inducible = ~self._body_moments.permanent.numpy()
+        start = np.zeros((len(self._placed.volumes), 3))
+        inducible = ~self._placed.table.permanent.numpy()
         for part, shape in enumerate(own_shapes):
             rows = slice(self._first_moments[part], self._first_moments[part + 1])
             if shape in magnetizations and inducible[rows].all():

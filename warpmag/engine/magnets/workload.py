@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from warpmag.engine.magnets.placed_moments import PlacedMoments
 from warpmag.moments.part_times import part_times
 
 _MOST_LINES = 10
@@ -53,9 +54,9 @@ class Workload:
         return "\n".join(lines)
 
 
-def workload(magnetics) -> Workload:
-    """Return the workload of the last solve of a ``Magnetics``; see :meth:`Magnetics.workload`."""
-    system, magnets = magnetics.system, magnetics.magnets
+def workload(magnetics, placed: PlacedMoments) -> Workload:
+    """Return the workload of the last solve of the moments ``placed``; see :meth:`Magnetics.workload`."""
+    system, magnets = placed.system, placed.magnets
     counts = np.array([len(magnet.lattice.volumes) for magnet in magnets])
     worlds = np.array([magnet.world for magnet in magnets])
     firsts = np.cumsum(counts) - counts

@@ -1,0 +1,38 @@
+"""Work lists whose entries belong to worlds: those of worlds that rest become empty."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def _leave_out(
+    whole_in: wp.array2d[int],
+    world_in: wp.array[int],
+    resting_in: wp.array[int],
+    column: int,
+    begin: int,
+    entries_out: wp.array2d[int],
+):
+    entry = wp.tid()
+    end = whole_in[entry, column]
+    if resting_in[world_in[entry]] != 0:
+        end = int(0)
+        if begin >= 0:
+            end = whole_in[entry, begin]
+    entries_out[entry, column] = end
+
+
+def record_leave_out(whole, world, resting, column: int, begin: int, entries) -> wp.Launch:
+    """Return a launch that empties the entries of resting worlds, and restores those of other worlds.
+
+    Args:
+        whole: All entries, shape [entries, columns].
+        world: World of each entry, shape [entries].
+        resting: Not 0 for worlds that rest, shape [worlds].
+        column: Column that holds the end of a range, or the number of its items.
+        begin: Column that holds the begin of the range; -1 for a number of items.
+        entries: Out, the list that is read; only ``column`` is written.
+    """
+    inputs = [whole, world, resting, column, begin]
+    return wp.launch(_leave_out, len(whole), inputs, outputs=[entries], device=entries.device, record_cmd=True)
