@@ -393,11 +393,13 @@ def test_a_needle_of_a_model_turns_into_the_field(device):
     along = np.array([0.0, -math.sin(angle), math.cos(angle)])
     volume = 1e-5
     moment = volume * 1e3 * (2.28 * np.array([0, 0, 1]) + (40.9 - 2.28) * along[2] * along)
-    np.testing.assert_allclose(wrench[3:], oracle.MU0 * np.cross(moment, field), rtol=0.05, atol=1e-9)
+    np.testing.assert_allclose(
+        wrench[3:], oracle.MU0 * np.cross(moment, field), rtol=0.05, atol=1e-4 * np.abs(wrench[3:]).max()
+    )
     np.testing.assert_allclose(wrench[:3], 0.0, atol=1e-6 * np.abs(wrench).max() / 0.05)
     # bitwise equal when repeated, and from a graph
     again = model.state()
-    magnetics.system.start_cold()
+    magnetics.reset()
     with wp.ScopedCapture(device=device) as capture:
         magnetics.apply(again)
     again.clear_forces()
