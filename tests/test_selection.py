@@ -137,7 +137,7 @@ def test_a_direction_as_magnetization_warns(builder):
 def test_a_strength_of_no_magnet_warns(builder, add, magnetization, meant):
     arguments = {"body": "cube"} if add is warpmag.add_permanent else {"positions": [UP], "radius": 0.005}
     value = f"{max(magnetization):g}".replace("+", r"\+")
-    message = rf"^magnetization: {value} A/m is none of a permanent magnet \(1000 to 2e\+06 A/m\){meant}$"
+    message = rf"^magnetization: {value} A/m is not that of a permanent magnet \(1000 to 2e\+06 A/m\){meant}$"
     with pytest.warns(warpmag.UnitWarning, match=message) as caught:
         add(builder, magnetization=magnetization, **arguments)
     assert caught[0].filename == __file__

@@ -17,7 +17,7 @@ def warn_of_magnetization(magnetization: float) -> None:
         return
     remanence = f"; for {magnetization:g} T give remanence={magnetization:g} and a direction"
     meant = remanence if magnetization <= _STRONGEST_REMANENCE else ""
-    text = f"magnetization: {magnetization:g} A/m is none of a permanent magnet ({least:g} to {most:g} A/m){meant}"
+    text = f"magnetization: {magnetization:g} A/m is not that of a permanent magnet ({least:g} to {most:g} A/m){meant}"
     warn_caller(text, UnitWarning)
 
 
