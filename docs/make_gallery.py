@@ -122,12 +122,16 @@ def film_example(name: str) -> None:
 def picture(name: str) -> str:
     """Return the path of a film from the page, or of the finished picture of a scene without one."""
     film = FOLDER / f"{name}.webp"
-    return (film if film.exists() else DOCS / "pictures" / f"{name}.jpg").relative_to(DOCS).as_posix()
+    drawn = film.exists() and film.stat().st_size > 0
+    return (film if drawn else DOCS / "pictures" / f"{name}.jpg").relative_to(DOCS).as_posix()
 
 
 def page() -> str:
     """Return the page of the gallery."""
-    head = "# Gallery\n\n`docs/make_gallery.py` runs each scene and example and draws these films by ray tracing.\n\n"
+    head = (
+        "# Gallery\n\n`docs/make_gallery.py` runs each scene and example and draws these films by ray tracing.\n"
+        "Stills of scenes are [drawn by Blender](pictures.md).\n\n"
+    )
     entries = [(f"warpmag run {name}", scene_line(name), name) for name in SCENES]
     examples_of = [(f"python -m warpmag.examples {name}", line, name) for name, line in examples.get_examples().items()]
     sections = (("Scenes", entries), ("Examples", examples_of))
