@@ -36,7 +36,8 @@ class FieldProbe:
         prepare: Function that launches the moments before each measurement; None if they are there.
 
     Raises:
-        InputError: ``worlds`` has a wrong shape, or holds a world that the system lacks.
+        InputError: ``worlds`` has a wrong shape, or holds a world that the system lacks. Or an argument has another
+            type than it must have.
 
     Attributes:
         points: The points [m], shape [p]; written by the caller before :meth:`measure`.
@@ -61,6 +62,8 @@ class FieldProbe:
         if not isinstance(system, MomentSystem):
             raise InputError(f"system: must be a MomentSystem, got {short_repr(system)}")
         check_flag("gradients", gradients)
+        if prepare is not None and not callable(prepare):
+            raise InputError(f"prepare: must be a function or None, got {short_repr(prepare)}")
         ranges = system.world_ranges
         check_whole("count", count)
         if not 0 <= count < 2**31:
