@@ -23,8 +23,8 @@ from warpmag.show.ray_tracing import ModelRenderer
 DOCS = Path(__file__).parent
 FOLDER = DOCS / "pictures" / "gallery"
 SIZE = (360, 202)  # px
-SCENES = {"alphabets": 120, "balls_up": 60, "crystal_balls": 1, "falling_magnet": 90, "sakura_tree": 100}
-"""Scenes, and the number of frames to run."""
+SCENES = {"alphabets": 120, "balls_up": 60, "crystal_balls": 0, "falling_magnet": 90, "sakura_tree": 100}
+"""Scenes, and the number of frames to run; 0 for a scene at rest, which has a still."""
 OPTIONS = {"worlds": "--world-count 5", "compass_swarm": "--columns 1 --rows 8", "sorter": "--coils 3"}
 """Options of examples that are too large for a small picture."""
 VIEWS = {
@@ -148,7 +148,8 @@ def page() -> str:
 def main() -> None:
     """Make the films named on the command line, or all, and the page."""
     FOLDER.mkdir(parents=True, exist_ok=True)
-    for name in sys.argv[1:] or [*SCENES, *examples.get_examples()]:
+    moving = [name for name, frames in SCENES.items() if frames]
+    for name in sys.argv[1:] or [*moving, *examples.get_examples()]:
         (film_scene if name in SCENES else film_example)(name)
     (DOCS / "gallery.md").write_text(page(), encoding="utf-8")
 
