@@ -146,7 +146,7 @@ class ShapeSampler:
         if fixed:
             return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solids=tuple(parts))
         cells = softened(coupling(filled, filled.radii), filled)
-        with contextlib.suppress(np.linalg.LinAlgError):  # wires of lengths beyond 1e9 radii keep the cells' response
+        with contextlib.suppress(np.linalg.LinAlgError):  # long wires keep the response of their cells
             cells = with_surface_response(cells, filled, solids)
         faces = None if permanent else joined([self._faces(*pair) for pair in zip(shapes, solids, strict=True)])
         return BodyLattice(filled.positions, filled.volumes, filled.radii, counts, cells, tuple(parts), faces)
