@@ -268,7 +268,7 @@ def fill(
 
 
 def _steps(lattice: Lattice, most: int) -> int:
-    """Return a number of steps of the spacing of which none but the last can leave at most ``most`` moments.
+    """Return a number of steps of the spacing. Only after the last step can at most ``most`` moments be left.
 
     The number of cells in a row, as in a wire, falls as the spacing grows. All else takes single steps.
     """

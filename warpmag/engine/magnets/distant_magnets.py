@@ -71,7 +71,7 @@ def _distant_body(label: str, lattice: BodyLattice, *, among_others: bool) -> Di
 
 
 class DistantMagnets:
-    """Two systems of the same magnets, of which one is solved in each world: one with cells, one with few moments.
+    """Two systems of the same magnets, with cells and with few moments. Each world solves only the first or the second.
 
     Attributes:
         few: The moments, few in place of the cells of some bodies.
