@@ -216,6 +216,7 @@ class AppliedForces(AppliedField):
             of ``response``.
 
     Attributes:
+        movable: 1 for moments whose force is computed, on the device, shape [n].
         expansion: Field expanded about the balls (``balls.h``), shape [chunks, rows, CHUNK]; None without balls.
         wrenches: Force [N] and torque [N·m] on each source whose reaction is computed, shape [sources, 7]. Torques are
             about the source's origin, or about the first moment of a permanent body. Wrenches on the moments of a body
@@ -235,7 +236,7 @@ class AppliedForces(AppliedField):
         source_of_moment[[solid.first for solid in sources.solids]] = bodies
         self._moves = bool(np.any(movable))
         self._fine_tables: dict[str, wp.array] | None = None
-        self._movable, self._source = self._integers(np.asarray(movable, bool)), self._integers(source_of_moment)
+        self.movable, self._source = self._integers(np.asarray(movable, bool)), self._integers(source_of_moment)
         self._worlds, self._ball_worlds = np.asarray(worlds), np.asarray(worlds)[ball_indices]
         self._lay_out_rows(np.zeros(0, int))
 
@@ -249,7 +250,7 @@ class AppliedForces(AppliedField):
             forces, torques: Forces [N] and torques [N·m] to add to, Warp arrays, shape [n].
         """
         sources, cells = self.sources, self.arrays.cells
-        ranges, movable = sources.bodies_of(self._worlds), self._movable.numpy()
+        ranges, movable = sources.bodies_of(self._worlds), self.movable.numpy()
         near_cells.lay_out(cells, bodies, rotations, ranges, movable, sources.dtype, self.device)
         cells.forces, cells.torques = forces, torques
         self.cell_count = cells.cell.shape[0]
@@ -329,7 +330,7 @@ class AppliedForces(AppliedField):
         if not self._moves:
             return
         self.run_passes(ON_CELLS, ON_CELLS, self.cell_count, _GROUP, _CELLS_PER_THREAD)
-        inputs = [self._movable, self._source, effective, *self.along, self.wrenches]
+        inputs = [self.movable, self._source, effective, *self.along, self.wrenches]
         kernel = _force_kernel(self.sources.dtype)
         wp.launch(kernel, self.count, inputs=inputs, outputs=[forces, torques], device=self.device)
 

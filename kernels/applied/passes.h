@@ -149,6 +149,7 @@ CUDA_CALLABLE inline Wrench wrench_on_targets(const Arrays& arrays, int s, const
 template <class Arrays> CUDA_CALLABLE inline void react(const Arrays& arrays, int row) {
     const auto& range = arrays.row.data[row]; // source, range of targets, balls or cells, which of these
     const int s = range[0], coils = arrays.coils.kind.shape[0];
+    if (range[1] >= range[2]) return; // of a world that rests
     const PermanentBody body = SOLIDS && s >= coils ? body_at(arrays, s - coils) : PermanentBody{};
     Real3 force = {0, 0, 0}, torque = force;
     if (range[3] == OF_TARGETS) {
@@ -221,6 +222,12 @@ template <class Arrays> CUDA_CALLABLE inline void add_up(const Arrays& arrays, i
     for (int k = 0; k < WRENCH_ROW; ++k) arrays.wrench.data[WRENCH_ROW * (size_t)s + k] = total[k];
 }
 
+// True for a cell with permanent bodies in its world, unless the world rests.
+template <class Arrays> CUDA_CALLABLE inline bool has_bodies(const Arrays& arrays, int c) {
+    const auto& cell = arrays.cells.cell.data[c]; // moment, body of its rotation, range of permanent bodies
+    return cell[2] < cell[3];
+}
+
 template <class Word, class Arrays>
 CUDA_CALLABLE inline void apply_sources(int thread, int first, int last, int threads, Word* team,
                                         const Arrays& arrays) {
@@ -230,11 +237,11 @@ CUDA_CALLABLE inline void apply_sources(int thread, int first, int last, int thr
         if constexpr (PASS < 0 || PASS == AT_POINTS)
             if (pass == AT_POINTS) field_at_targets<true>(arrays, i);
         if constexpr (CELLS && (PASS < 0 || PASS == AT_CELLS))
-            if (pass == AT_CELLS) average_over_cell(arrays, i);
+            if (pass == AT_CELLS && has_bodies(arrays, i)) average_over_cell(arrays, i);
         if constexpr (BALLS && (PASS < 0 || PASS == AT_BALLS))
             if (pass == AT_BALLS) expand(arrays, i);
         if constexpr (CELLS && (PASS < 0 || PASS == ON_CELLS))
-            if (pass == ON_CELLS) act_on_cell(arrays, i);
+            if (pass == ON_CELLS && has_bodies(arrays, i)) act_on_cell(arrays, i);
         if constexpr (PASS < 0 || PASS == REACT)
             if (pass == REACT) react(arrays, i);
         if constexpr (PASS < 0 || PASS == ADD_UP)

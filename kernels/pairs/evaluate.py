@@ -70,6 +70,7 @@ class PairEvaluation:
         form: ``LOOP``, ``FUSED``, ``MIRRORED``, ``REFERENCE`` or ``GIVEN``.
         count: Number of target rows.
         target: Packed column of each target row, shape [count].
+        row_end: End of the sources of each target row; a GPU leaves out rows with -1, shape [count].
         tiles: Work list on the device (``work_list``), shape [tiles, TILE_COLUMNS].
         pair_count: Number of pairs of a target and a source.
         partial: Partial sums, shape [parts, rows, sums]; the caller's ``extra_parts`` are last.
@@ -88,7 +89,8 @@ class PairEvaluation:
             segments = segments[:1, [2, 3, 2, 3]]
         self._arrays = a = work_list.arrays_type(dtype)()
         a.target, a.begin, a.end = work_list.target_rows(segments, device)
-        self.target, self.count, self.pair_count = a.target, a.target.shape[0], work_list.pair_count(segments)
+        self.target, self.row_end, self.count = a.target, a.end, a.target.shape[0]
+        self.pair_count = work_list.pair_count(segments)
         shared = self.form in (LOOP, MIRRORED) and self.pair_count >= _LEAST_SHARED["cuda" if device.is_cuda else "cpu"]
         self._ranks = ranks if shared else None
         self._finished = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity

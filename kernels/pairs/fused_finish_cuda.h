@@ -11,6 +11,7 @@ CUDA_CALLABLE inline void sum_and_finish(const Arrays& arrays) {
     // not Warp's thread index, whose division would delay everything that follows
     const int block = blockIdx.x, thread = threadIdx.x;
     const TileEntry& tile = ((const TileEntry*)arrays.tiles.data)[block];
+    if (tile.row_end <= tile.row_begin) return; // of a world that rests
     const int i = tile.column_begin + thread;
     const bool has_target = thread < tile.row_end - tile.row_begin;
     Vector base = {0, 0, 0};

@@ -36,6 +36,7 @@ template <class Lists> __device__ inline void list_neighbors(int thread, const L
     const int search = targets.searching.data[0], i = thread / 32, c = thread % 32;
     if (search == 0) return;
     if (thread == 0) targets.moved.data[0] = 0, sources.searches.data[0] = search;
+    if (targets.group.data[i] < 0) return;
     __shared__ int lists[BLOCK / 32][CAPACITY], counts[BLOCK / 32];
     int* const list = lists[threadIdx.x / 32];
     int& neighbors = counts[threadIdx.x / 32];

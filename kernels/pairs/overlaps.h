@@ -52,6 +52,7 @@ template <class Places, class Lanes> inline int append(int* list, Places j, Lane
 
 // Lists the neighbors of target i that overlap it. If the list of neighbors is full, only its count is copied.
 template <class Lists> CUDA_CALLABLE inline void list_overlaps(const Lists& targets, const Lists& sources, int i) {
+    if (targets.group.data[i] < 0) return;
     const Balls own = balls_of(targets), others = balls_of(sources);
     const int count = targets.count.data[i];
     const int* const neighbors = targets.neighbor.data + (size_t)CAPACITY * i;

@@ -47,11 +47,14 @@ def _pack_kernel(dtype):
         moments: wp.array[vec3],
         radii: wp.array[dtype],
         labels: wp.array[int],
+        active_groups: wp.array[int],
         found_at: wp.array[vec3],
         packed_out: wp.array2d[dtype],
         moved_out: wp.array[int],
     ):
         i = wp.tid()
+        if active_groups[i] < 0:
+            return
         x = positions[i]
         m = moments[i]
         for c in range(3):
@@ -74,6 +77,8 @@ class PackedMoments:
         count: Number of moments n.
         packed: Packed moments, shape [8, n].
         moments: Rows of the moments, a view of ``packed``, shape [3, n].
+        active_groups: World of each moment, or -1 for moments that :meth:`pack` and :meth:`find_overlaps` leave as they
+            are, on the device, shape [n].
         neighbors, neighbor_counts, overlaps, overlap_counts, searching: Lists of ``neighbors.lists_type``, valid after
             :meth:`find_overlaps`; without neighbors before.
     """
@@ -103,7 +108,8 @@ class PackedMoments:
         self.packed: wp.array = pitched[:, :n] if n else pitched
         self.moments = self.packed[4:7] if n else self.packed
         ratio = 1.0 + neighbors.SKIN if moving else 1.0
-        lists = neighbors.allocate(n, self.packed, self.groups, reach=2.0 * largest_radius, ratio=ratio)
+        self.active_groups = wp.clone(self.groups)
+        lists = neighbors.allocate(n, self.packed, self.active_groups, reach=2.0 * largest_radius, ratio=ratio)
         self._lists = lists
         self.neighbors, self.neighbor_counts, self.searching = lists.neighbor, lists.count, lists.searching
         self.overlaps, self.overlap_counts = lists.overlap, lists.overlap_count
@@ -139,7 +145,7 @@ class PackedMoments:
     def pack(self, positions, moments):
         """Pack positions [m] and moments [A·m²], Warp arrays of vectors, shape [n]."""
         if self.count:
-            inputs = [positions, moments, self.radii, self.labels, self._lists.found_at]
+            inputs = [positions, moments, self.radii, self.labels, self.active_groups, self._lists.found_at]
             outputs = [self.packed, self._lists.moved]
             wp.launch(_pack_kernel(self.dtype), self.count, inputs=inputs, outputs=outputs, device=self.device)
 

@@ -18,6 +18,7 @@ CUDA_CALLABLE inline void sum_tile(int thread, const wp::array_t<int>& tiles, co
     const int lane = thread % 32, warp = thread / 32 % WARPS;
     const TileEntry& tile = ((const TileEntry*)tiles.data)[thread / (32 * WARPS)];
     const int row_begin = tile.row_begin, count = tile.row_end - row_begin, column_begin = tile.column_begin;
+    if (count <= 0) return; // of a world that rests
     const int per_warp = (tile.source_end - tile.source_begin + WARPS - 1) / WARPS, split = tile.split;
     const int source_begin = tile.source_begin + warp * per_warp;
     const int source_end = min(tile.source_end, source_begin + per_warp);

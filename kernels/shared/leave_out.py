@@ -12,18 +12,19 @@ def _leave_out(
     resting_in: wp.array[int],
     column: int,
     begin: int,
+    empty: int,
     entries_out: wp.array2d[int],
 ):
     entry = wp.tid()
     end = whole_in[entry, column]
     if resting_in[world_in[entry]] != 0:
-        end = int(0)
+        end = empty
         if begin >= 0:
             end = whole_in[entry, begin]
     entries_out[entry, column] = end
 
 
-def record_leave_out(whole, world, resting, column: int, begin: int, entries) -> wp.Launch:
+def record_leave_out(whole, world, resting, column: int, entries, *, begin: int = -1, empty: int = 0) -> wp.Launch:
     """Return a launch that empties the entries of resting worlds, and restores those of other worlds.
 
     Args:
@@ -31,8 +32,9 @@ def record_leave_out(whole, world, resting, column: int, begin: int, entries) ->
         world: World of each entry, shape [entries].
         resting: Not 0 for worlds that rest, shape [worlds].
         column: Column that holds the end of a range, or the number of its items.
-        begin: Column that holds the begin of the range; -1 for a number of items.
         entries: Out, the list that is read; only ``column`` is written.
+        begin: Column that holds the begin of the range, which is written to ``column``; -1 to write ``empty``.
+        empty: Value of ``column`` in an empty entry without a begin.
     """
-    inputs = [whole, world, resting, column, begin]
+    inputs = [whole, world, resting, column, begin, empty]
     return wp.launch(_leave_out, len(whole), inputs, outputs=[entries], device=entries.device, record_cmd=True)

@@ -1,51 +1,74 @@
 """Work lists of a system of moments without the worlds that rest."""
 
+import numpy as np
 import warp as wp
 
+from warpmag.kernels.applied.fields import AppliedForces
 from warpmag.kernels.pairs.evaluate import FUSED, LOOP
 from warpmag.kernels.shared.leave_out import record_leave_out
 from warpmag.moments.system import MomentSystem
 
-_ROWS, _SOURCES = (1, 0), (4, 3)
+_TILE_ROWS, _TILE_SOURCES = {"column": 1, "begin": 0}, {"column": 4, "begin": 3}
 """Columns of end and begin of the target rows and of the sources of a tile (``kernels.pairs.work_list``)."""
-_COUNT = (1, -1)
+_COUNT = {"column": 1}
 """Column of the number of moments of a chunk."""
+_BODIES = {"column": 3, "begin": 2}
+"""Columns of the range of permanent bodies that act on a cell (``kernels.applied.near_cells``)."""
+_ITEMS = {"column": 2, "begin": 1}
+"""Columns of the range of targets or cells of a row of a reaction (``kernels.applied.fields``)."""
+_NONE, _ZERO = {"column": 0, "empty": -1}, {"column": 0}
+"""Entries that are single numbers: −1 or 0 stands for no entry."""
 
 
 class RestingWorlds:
-    """Removes the worlds that rest from the sums over pairs, the couplings of cells and the fields of sources.
+    """Removes the worlds that rest from all passes over moments, pairs, cells and the targets of sources.
 
-    These take most of the time of a solve. The other passes skip such worlds by themselves or cost little.
+    The passes of the solve itself skip such worlds without lists.
     """
 
     def __init__(self, system: MomentSystem):
         """Copy the work lists of ``system``."""
         self._system, self._launches, self._kept = system, [], []
+        worlds, on_gpu = system.worlds, system.device.is_cuda
+        self._add(system._packed.active_groups, worlds, _NONE)
         evaluations = [system._permanent_field, system._inducible_field]
         evaluations += [evaluation for parts in system._wrench.values() for evaluation in parts]
-        # without target rows a tile of a GPU would read beyond its table
-        ranges = (_SOURCES,) if system.device.is_cuda else (_ROWS, _SOURCES)
         for evaluation in evaluations:
             if evaluation.form in (LOOP, FUSED):
-                self._add(evaluation.tiles, 2, ranges)
+                self._add(evaluation.tiles, worlds[_column(evaluation.tiles, 2)], _TILE_ROWS, _TILE_SOURCES)
+            if on_gpu:  # on a CPU vectors of rows belong to several worlds
+                self._add(evaluation.row_end, worlds[evaluation.target.numpy()], _NONE)
         if system._cells is not None:
-            self._add(system._cells.chunks, 0, (_COUNT,))
+            self._add(system._cells.chunks, worlds[_column(system._cells.chunks, 0)], _COUNT)
         if system.source_interaction is not None:
-            self._add(system.source_interaction.arrays.targets.chunk, 0, (_COUNT,))
+            self._add_sources(system.source_interaction)
 
-    def _add(self, entries: wp.array, moment: int, ranges) -> None:
-        """Add a list of entries with a moment in column ``moment``, and the columns of the ranges to empty."""
+    def _add_sources(self, interaction: AppliedForces) -> None:
+        """Add the lists of targets of sources, of cells near permanent bodies, and of reactions."""
+        worlds, arrays, sources = self._system.worlds, interaction.arrays, interaction.sources
+        chunks, rows, of_source = arrays.targets.chunk, arrays.row, (*sources.applied, *sources.solids)
+        self._add(chunks, worlds[_column(chunks, 0)], _COUNT)
+        if interaction.cell_count:
+            self._add(arrays.cells.cell, worlds[_column(arrays.cells.cell, 0)], _BODIES)
+        self._add(rows, np.array([of_source[s].world for s in _column(rows, 0)], int), _ITEMS)
+        self._add(interaction.movable, worlds, _ZERO)
+
+    def _add(self, entries: wp.array, world: np.ndarray, *ranges: dict[str, int]) -> None:
+        """Add a list of entries with their worlds, and the columns to empty."""
         if not len(entries):
             return
-        system, whole = self._system, entries.numpy()
+        system, whole = self._system, entries.numpy().reshape(len(entries), -1)
         table = wp.array(ptr=entries.ptr, dtype=wp.int32, shape=whole.shape, device=system.device)
-        world = wp.array(system.worlds[whole.T[moment]], dtype=wp.int32, device=system.device)
-        copy = wp.array(whole, dtype=wp.int32, device=system.device)
+        copy, of_world = (wp.array(values, dtype=wp.int32, device=system.device) for values in (whole, world))
         self._kept.append((entries, table))
-        for end, begin in ranges:
-            self._launches.append(record_leave_out(copy, world, system.resting, end, begin, table))
+        self._launches += [record_leave_out(copy, of_world, system.resting, entries=table, **ends) for ends in ranges]
 
     def leave_out(self) -> None:
         """Launch the removal of the worlds that rest, and the return of the others."""
         for launch in self._launches:
             launch.launch()
+
+
+def _column(entries: wp.array, number: int) -> np.ndarray:
+    """Return a column of a list of integers."""
+    return entries.numpy().reshape(len(entries), -1)[:, number]

@@ -209,8 +209,17 @@ class DistantMagnets:
         placed.add_wrenches(self._model, state)
 
     def persistent_arrays(self) -> dict[str, wp.array]:
-        """Return the arrays that the next solve reads, by name."""
-        return self.few.system.persistent_arrays() | {"saturated": self._choice.saturated}
+        """Return the arrays that the next solve and :meth:`add_forces` read, by name."""
+        choice = self._choice
+        own = {name: getattr(choice, name) for name in ("saturated", "any_many", "any_few")}
+        return self.few.system.persistent_arrays() | own
+
+    def evaluate_again(self) -> None:
+        """Launch all that a solve computes from restored arrays, without a step."""
+        if self._resting is not None:
+            self._resting.leave_out()
+        for system in self.systems:
+            system.evaluate_again()
 
     def energy(self) -> np.ndarray:
         """Return the energy of each world with magnets [J]; waits for the device."""

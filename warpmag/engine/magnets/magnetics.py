@@ -644,8 +644,7 @@ class Magnetics:
             restore()
             self._induced = induced
             if induced:
-                for system in systems:
-                    system.evaluate_again()
+                (self._distant or self.system).evaluate_again()
                 restore()
 
     def start_from(self, magnetizations: dict[int, np.ndarray]) -> None:
