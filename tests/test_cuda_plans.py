@@ -24,7 +24,7 @@ from warpmag.kernels.fmm import expansions, sharing
 from warpmag.kernels.induction.solve_state import BLOCK_CHUNK
 from warpmag.kernels.near_contact.images import IronFaces
 from warpmag.kernels.pairs import evaluate, fused_cuda, mirror_cuda, sums_cuda
-from warpmag.kernels.pairs.evaluate import FUSED, GIVEN, LOOP, MIRRORED, REFERENCE, PairEvaluation
+from warpmag.kernels.pairs.evaluate import FUSED, GIVEN, LOOP, MIRRORED, REFERENCE, SHORT, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_law import WIDTHS, Quantity
 from warpmag.moments import fmm, system
@@ -181,6 +181,19 @@ def test_few_moments_take_one_kernel(quantity, which, launches):
     assert_each_pair_once(sums, SEGMENTS[which], tiles, shape.targets)
     assert (launch.threads, launch.block) == (len(tiles) * shape.threads, shape.threads)
     assert shape.shares * shape.targets <= shape.correcting
+
+
+@pytest.mark.parametrize("quantity", QUANTITIES)
+def test_many_small_worlds_take_one_kernel(quantity, launches):
+    """A group of threads takes a row; worlds of more moments take tiles."""
+    for size, form in ((12, SHORT), (64, LOOP)):
+        segments = [(k, k + size, k, k + size) for k in range(0, 9600, size)]
+        sums = evaluation(quantity, 9600, segments)
+        assert sums.form == form
+        launches.clear()
+        sums.launch()
+        assert launches[0].name == ("sum_and_finish_row" if form == SHORT else "sum_tile")
+        assert launches[-1].threads == 8 * sums.count and len(launches) == (1 if form == SHORT else 2)
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
@@ -454,6 +467,7 @@ def test_every_kernel_compiles(launches, tmp_path):
             evaluation(quantity, most or 100_000, dtype=dtype).launch()
         for most, _ in sums_cuda._SHAPES.get(quantity, ()):
             evaluation(quantity, most or 100_000, dtype=dtype, form=LOOP).launch()
+        evaluation(quantity, 100, dtype=dtype, form=SHORT).launch()
     for worlds, contact_max, bodies in ((1, 1000, 3), (1, 60_000, 3), (20, 1000, 3), (20, 1000, 60), (1, 1000, 150)):
         solver, model, contacts = pile(worlds, contact_max, bodies)
         solver.step(model.state(), model.state(), None, contacts, 1e-3)

@@ -9,7 +9,7 @@ from arrangements import as_float32, overlapping, pile, relative
 import warpmag
 from bench.reference import oracle
 from warpmag.kernels.pairs import fused_cuda, mirror_cuda
-from warpmag.kernels.pairs.evaluate import FUSED, LOOP, MIRRORED, PairEvaluation
+from warpmag.kernels.pairs.evaluate import FUSED, LOOP, MIRRORED, SHORT, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments
 from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.shared import team
@@ -264,7 +264,7 @@ def test_mirrored_passes(slabs, quantity, dtype, device, monkeypatch):
 
 def forms(device, *mirrored):
     """Forms of the sums on the device, with or without the mirrored form; a CPU has one form."""
-    return (LOOP,) if device == "cpu" else (LOOP, FUSED, *mirrored)
+    return (LOOP,) if device == "cpu" else (LOOP, FUSED, SHORT, *mirrored)
 
 
 def sums(x, radii, m, segments, quantity, dtype, device, bodies=None, *, groups=None, form):

@@ -9,6 +9,7 @@ that results do not depend on scheduling, and corrects overlapping pairs. Only t
 |---|---|---|
 | ``LOOP`` | ``sums_cuda``, ``sums_cpu`` | any moments; partial sums of tiles |
 | ``FUSED`` | ``fused_cuda`` | few moments: one kernel sums a tile and finishes it, without partial sums |
+| ``SHORT`` | ``short_finish_cuda`` | many targets with few sources each: one kernel, a group of threads a target |
 | ``MIRRORED`` | ``mirror_cuda`` | many moments among themselves: each pair is evaluated once, for both its moments |
 | ``REFERENCE`` | ``reference`` | a plain Warp loop, exact for overlapping balls, or with the paper's smoothing |
 
@@ -31,13 +32,16 @@ from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
-LOOP, FUSED, MIRRORED, REFERENCE, GIVEN = "loop", "fused", "mirrored", "reference", "given"
+LOOP, FUSED, SHORT, MIRRORED, REFERENCE, GIVEN = "loop", "fused", "short", "mirrored", "reference", "given"
 
 # Measured on an H200: most targets for which the fused form is fastest, and fewest for which the mirrored form is
 # fastest.
 _MOST_FUSED = {Quantity.FIELD: 7000, Quantity.FORCE: 2640, Quantity.MUTUAL_FORCE: 2640, Quantity.WRENCH: 2640}
 _LEAST_MIRRORED = {Quantity.FIELD: 5281, Quantity.MUTUAL_FORCE: 2641}
 _LEAST_MUTUAL = 0.75  # least fraction of the sources that are targets, for which the mirrored form is faster
+_MOST_SHORT = 48, 256
+"""Most targets and most sources of a segment with the form ``SHORT``. A tile of the loop has 96 to 256 targets, most of
+which would be copies."""
 _LEAST_SHARED = {"cpu": 800_000, "cuda": 1_000_000_000}
 """Fewest pairs for which several processes share the sums, by kind of device."""
 _CONSTANTS = {"CAPACITY": CAPACITY, "MU0": MU0, "INVERSE_4PI": INVERSE_4PI}
@@ -67,7 +71,7 @@ class PairEvaluation:
         ranks: Processes that share the sums (``warpmag.moments.ranks.Ranks``); None for a single process.
 
     Attributes:
-        form: ``LOOP``, ``FUSED``, ``MIRRORED``, ``REFERENCE`` or ``GIVEN``.
+        form: ``LOOP``, ``FUSED``, ``SHORT``, ``MIRRORED``, ``REFERENCE`` or ``GIVEN``.
         count: Number of target rows.
         target: Packed column of each target row, shape [count].
         row_end: End of the sources of each target row; a GPU leaves out rows with -1, shape [count].
@@ -125,6 +129,10 @@ class PairEvaluation:
             shape = fused_cuda.choose_fused_shape(finished, count)
             self._launch_sums = lambda a: _launch_fused(finished, shape, a)
             return 0, work_list.block_tiles(segments, shape.targets)
+        if self.form == SHORT:
+            kernel = _short_kernel(targets.dtype, finished, group_threads(device))
+            self._launch_sums = lambda _: self._launch_pass(kernel, 1)
+            return 0, ()
         if device.is_cuda:
             shape = sums_cuda.choose_loop_shape(finished, count)
             tiles, parts = work_list.loop_tiles(segments, shape, device.sm_count)
@@ -154,7 +162,7 @@ class PairEvaluation:
             self._ranks.merge(self._summed)
         if wait is not None:
             wait()
-        if self.form != FUSED:
+        if self.form not in (FUSED, SHORT):
             finish = _finish_kernel(self.partial.dtype, self._finished, group_threads(self.partial.device))
             # the threads that summed are awake, and a row whose overlap list is full visits all its sources
             self._launch_pass(finish, threads_for(self.pair_count, PAIRS_PER_THREAD))
@@ -175,7 +183,12 @@ def _choose_form(quantity, segments, device, same_set, extra_parts) -> str:
     count = int(np.sum(segments[:, 1] - segments[:, 0]))
     if same_set and count >= _LEAST_MIRRORED.get(quantity, np.inf) and _are_mutual(segments, count):
         return MIRRORED
-    return FUSED if count <= _MOST_FUSED[quantity] and not extra_parts else LOOP
+    if extra_parts:
+        return LOOP
+    if count <= _MOST_FUSED[quantity]:
+        return FUSED
+    sizes = segments[:, [1, 3]] - segments[:, [0, 2]]
+    return SHORT if (sizes.max(axis=0) <= _MOST_SHORT).all() else LOOP
 
 
 def _are_mutual(segments, count: int) -> bool:
@@ -192,6 +205,13 @@ def _finish_kernel(dtype, quantity: Quantity, group: int):
     call = f"finish<warpmag::Quantity({quantity:d})>(thread, threads, team.data, arrays)"
     arguments = {**PASS_ARGUMENTS, "arrays": work_list.arrays_type(dtype)}
     return native_kernel(call, "pairs/finish.h", arguments, dtype=dtype, GROUP=group, **_CONSTANTS)
+
+
+@cache
+def _short_kernel(dtype, quantity: Quantity, group: int):
+    call = f"sum_and_finish_row<warpmag::Quantity({quantity:d})>(arrays, thread / warpmag::GROUP)"
+    arguments = {**PASS_ARGUMENTS, "arrays": work_list.arrays_type(dtype)}
+    return native_kernel(call, "pairs/short_finish_cuda.h", arguments, dtype=dtype, GROUP=group, **_CONSTANTS)
 
 
 @cache

@@ -36,7 +36,7 @@ class RestingWorlds:
         for evaluation in evaluations:
             if evaluation.form in (LOOP, FUSED):
                 self._add(evaluation.tiles, worlds[_column(evaluation.tiles, 2)], _TILE_ROWS, _TILE_SOURCES)
-            if on_gpu:  # on a CPU vectors of rows belong to several worlds
+            if on_gpu and evaluation.form != FUSED:  # on a CPU vectors of rows belong to several worlds
                 self._add(evaluation.row_end, worlds[evaluation.target.numpy()], _NONE)
         if system._cells is not None:
             self._add(system._cells.chunks, worlds[_column(system._cells.chunks, 0)], _COUNT)
