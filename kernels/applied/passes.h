@@ -128,7 +128,10 @@ CUDA_CALLABLE inline Wrench wrench_on_targets(const Arrays& arrays, int s, const
     const Real3 center =
         solid ? reference_point(arrays, body) : real3((const Real*)arrays.coils.frame.data + 7 * (size_t)s);
     const size_t pitch = arrays.effective.strides[0] / sizeof(Real);
-    for (int i = first + WIDTH * share(); i < last; i += WIDTH * SHARES) {
+    // a row of few targets: the threads share the moments and faces of the body in place of the targets
+    const bool shares_body = solid && last - first < SHARES;
+    const int begin = shares_body ? share() : 0, step = shares_body ? SHARES : 1;
+    for (int i = first + WIDTH * (share() - begin); i < last; i += WIDTH * SHARES / step) {
         const Targets at = targets_at(arrays, i, last - i);
         const Real* const m = arrays.effective.data + i;
         Mask mask = first_lanes(last - i);
@@ -137,7 +140,7 @@ CUDA_CALLABLE inline Wrench wrench_on_targets(const Arrays& arrays, int s, const
             if (solid) {
                 mask &= within_reach<Arrays>(body, at) & (at.label != body.label);
                 if (!any(mask)) continue;
-                field = target_field(field_correction(arrays, body, at.x, at.radius, mask, 0, 1));
+                field = target_field(field_correction(arrays, body, at.x, at.radius, mask, begin, step));
             }
         if constexpr (COILS)
             if (!solid) add_coil_fields(arrays, &s, 0, 1, 1, at, last - i, field);

@@ -16,6 +16,8 @@ from warpmag.kernels.shared.reductions import block_max, block_sum, fence
 DEPTH = 5  # changes between iterates that are stored and mixed (``anderson.h``)
 COLUMNS = 7 + DEPTH + DEPTH * (DEPTH + 1) // 2  # sums over the moments of a chunk or world; as in ``theta_step.h``
 BLOCK_CHUNK = 128  # moments in a chunk on a GPU, one per thread of a block; on a CPU a chunk has ``native.CHUNK``
+_CHUNK_SIZES = 4, 32, BLOCK_CHUNK
+"""Sizes for which the blocks of a GPU are made. Blocks for whole chunks would be mostly idle in small worlds."""
 
 
 @wp.struct
@@ -164,6 +166,13 @@ def bind(state, packed, material, moments, rtol: float, max_evaluations: int) ->
     state.saturation, state.slope, state.curve = material.saturation, material.slope, material.curve
     state.common_curve, state.curve_tables = material.common_curve, material.tables
     state.rtol, state.max_evaluations = rtol, max_evaluations
+
+
+def largest_chunk(state) -> int:
+    """Return the number of moments of the largest chunk, rounded up to one of few sizes."""
+    ends = state.chunk.numpy()
+    largest = (ends[:, 1] - ends[:, 0]).max(initial=0)
+    return next(size for size in _CHUNK_SIZES if size >= largest)
 
 
 @cache

@@ -54,7 +54,7 @@ from functools import cache
 import warp as wp
 
 from warpmag.kernels.induction.body_response import BodyResponses
-from warpmag.kernels.induction.solve_state import BLOCK_CHUNK, COLUMNS, DEPTH, state_type, world_summation
+from warpmag.kernels.induction.solve_state import COLUMNS, DEPTH, largest_chunk, state_type, world_summation
 from warpmag.kernels.material.curves import inverse_curve_ratio
 from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
@@ -63,8 +63,8 @@ from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, launch_passes, threads_for
 
 START, FIRST_SWEEP, LAST_SWEEP, MEASURE, CHOOSE, ADVANCE = range(6)  # passes in order; as in ``theta_flow.h``
-_START_BLOCKS = 4
-"""Blocks of a GPU that share a chunk of moments at the start of a solve, where a moment takes a group of threads."""
+_START_THREADS = 256
+"""Most threads of a GPU's block at the start of a solve, where a moment takes a group of threads."""
 _RESIDENT_BLOCKS = {wp.float32: (3, 5), wp.float64: (2, 3)}
 """Blocks of 256 threads per multiprocessor at the start and in sweeps; limits the registers that compilers use."""
 
@@ -87,7 +87,8 @@ def _passes_kernel(dtype, responding: bool):
 
 
 @cache
-def _begin_kernel(dtype, group: int, responding: bool):
+def _begin_kernel(dtype, group: int, responding: bool, blocks: int):
+    """Return the kernel that starts a solve; ``blocks`` blocks share a chunk."""
     state_struct = state_type(dtype)
 
     @wp.func_native("warpmag::start(state, warpmag::span_at(state, row));")
@@ -101,12 +102,12 @@ def _begin_kernel(dtype, group: int, responding: bool):
     @wp.kernel(module="unique", enable_backward=False, module_options=options, launch_bounds=bounds)
     def begin_flow(state: state_struct):
         block, lane = wp.tid()
-        chunk = state.chunk[block // wp.static(_START_BLOCKS)]
+        chunk = state.chunk[block // wp.static(blocks)]
         moments_per_block = wp.block_dim() // wp.static(group)
-        begin = chunk[0] + moments_per_block * (block % wp.static(_START_BLOCKS)) + lane // wp.static(group)
-        for row in range(begin, chunk[1], moments_per_block * wp.static(_START_BLOCKS)):
+        begin = chunk[0] + moments_per_block * (block % wp.static(blocks)) + lane // wp.static(group)
+        for row in range(begin, chunk[1], moments_per_block * wp.static(blocks)):
             start(state, row)
-        if block == wp.static(_START_BLOCKS) * state.chunk_begin[chunk[2]] and lane == 0:
+        if block == wp.static(blocks) * state.chunk_begin[chunk[2]] and lane == 0:
             begin_world(state, chunk[2])
 
     return begin_flow
@@ -200,13 +201,13 @@ class Launches:
             self.begin, self.sweeps = [passes(START, START)], [passes(FIRST_SWEEP, LAST_SWEEP)]
             self.iteration = [passes(MEASURE, ADVANCE)]
         else:
-            width = group * BLOCK_CHUNK // _START_BLOCKS
-            self.begin = [
-                record(_begin_kernel(dtype, group, responding), (_START_BLOCKS * chunks, width), block_dim=width)
-            ]
+            largest = largest_chunk(state)
+            blocks, block_dim = -(-group * largest // _START_THREADS), max(32, largest)
+            width, begin = group * largest // blocks, _begin_kernel(dtype, group, responding, blocks)
+            self.begin = [record(begin, (blocks * chunks, width), block_dim=width)]
             self.sweeps = [record(_sweep_kernel(dtype, group, responding), group * count, last) for last in (0, 1)]
             self.iteration = [
-                record(_convergence_kernel(dtype, group, responding), (chunks, BLOCK_CHUNK), block_dim=BLOCK_CHUNK),
+                record(_convergence_kernel(dtype, group, responding), (chunks, block_dim), block_dim=block_dim),
                 record(_advance_kernel(dtype, group, responding), count),
             ]
         if bodies is not None:
