@@ -8,6 +8,7 @@ import warp as wp
 import warpmag
 from warpmag.engine.magnets import magnetics as magnetics_module
 from warpmag.moments.arrays import restore_snapshot, take_snapshot
+from warpmag.moments.probe import FieldProbe
 from warpmag.shapes import demagnetization, distant_response, lattice
 from warpmag.shapes.softening import softened
 from warpmag.shapes.uniform_response import cell_matrix, with_surface_response
@@ -174,6 +175,9 @@ def test_worlds_choose_by_themselves(device, monkeypatch):
     model = model_of(device, 0.2, worlds=3)
     magnetics, cells, state = warpmag.Magnetics(model), with_cells(monkeypatch, model), model.state()
     bodies = state.body_q.numpy()
+    probes = [FieldProbe(each.system, 6, worlds=[0, 0, 1, 1, 2, 2]) for each in (magnetics, cells)]
+    for probe in probes:  # near the disc, where it acts by closed forms, and near the plate where it is far
+        probe.points.assign([[0.0, 0.0, 0.005], [0.0, 0.0, -0.198]] * 3)
     for near in ([1], [0, 1], [], [2]):
         for world in range(3):
             bodies[2 * world + 1, 2] = -0.004 - (0.02 if world in near else 0.2)
@@ -184,6 +188,10 @@ def test_worlds_choose_by_themselves(device, monkeypatch):
             rows = slice(2 * world, 2 * world + 2)
             assert relative(actual[rows], expected[rows]) < 5e-3
         np.testing.assert_allclose(magnetics.energy(), cells.energy(), rtol=1e-5)
+        for probe in probes:  # of the systems themselves: moments of cells at rest are those of this solve
+            probe.measure()
+        for row in range(6):
+            assert relative(*(probe.b.numpy()[row] for probe in probes)) < 2e-2
 
 
 @pytest.mark.cuda

@@ -47,13 +47,13 @@ def _pack_kernel(dtype):
         moments: wp.array[vec3],
         radii: wp.array[dtype],
         labels: wp.array[int],
-        active_groups: wp.array[int],
+        groups: wp.array[int],
         found_at: wp.array[vec3],
         packed_out: wp.array2d[dtype],
         moved_out: wp.array[int],
     ):
         i = wp.tid()
-        if active_groups[i] < 0:
+        if groups[i] < 0:
             return
         x = positions[i]
         m = moments[i]
@@ -142,10 +142,11 @@ class PackedMoments:
         """Rebuild the lists in the next search if any entry of ``chosen`` is not 0."""
         neighbors.launch_request_search(self._lists, chosen)
 
-    def pack(self, positions, moments):
-        """Pack positions [m] and moments [A·m²], Warp arrays of vectors, shape [n]."""
+    def pack(self, positions, moments, *, resting: bool = False):
+        """Pack positions [m] and moments [A·m²], Warp arrays of vectors, shape [n], with those that rest or without."""
         if self.count:
-            inputs = [positions, moments, self.radii, self.labels, self.active_groups, self._lists.found_at]
+            groups = self.groups if resting else self.active_groups
+            inputs = [positions, moments, self.radii, self.labels, groups, self._lists.found_at]
             outputs = [self.packed, self._lists.moved]
             wp.launch(_pack_kernel(self.dtype), self.count, inputs=inputs, outputs=outputs, device=self.device)
 

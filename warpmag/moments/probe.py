@@ -1,6 +1,5 @@
 """Field of a system's moments at points, in buffers allocated once."""
 
-from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -33,7 +32,6 @@ class FieldProbe:
         worlds: World of each point, shape [p]; None means the first for all. Points of one world should be adjacent,
             because each run of adjacent points is summed separately.
         gradients: True to compute gradients, which takes three more sums over pairs.
-        prepare: Function that launches the moments before each measurement; None if they are there.
 
     Raises:
         InputError: ``worlds`` has a wrong shape, or holds a world that the system lacks. Or an argument has another
@@ -55,15 +53,12 @@ class FieldProbe:
         *,
         worlds: npt.ArrayLike | None = None,
         gradients: bool = False,
-        prepare: Callable[[], None] | None = None,
     ):
         """Allocate all buffers."""
-        self._system, self._prepare = system, prepare
+        self._system = system
         if not isinstance(system, MomentSystem):
             raise InputError(f"system: must be a MomentSystem, got {short_repr(system)}")
         check_flag("gradients", gradients)
-        if prepare is not None and not callable(prepare):
-            raise InputError(f"prepare: must be a function or None, got {short_repr(prepare)}")
         ranges = system.world_ranges
         check_whole("count", count)
         if not 0 <= count < 2**31:
@@ -119,14 +114,14 @@ class FieldProbe:
         check_warp_array("points", self.points, vec3_type(system.dtype), system.device, (targets.count,))
         if targets.count == 0:
             return
-        if self._prepare is not None:
-            self._prepare()
+        if system.refresh is not None:
+            system.refresh()
         targets.pack(self.points, self._zeros)
         self._moments.pack(system.positions, system.moments)
         targets.find_overlaps(self._moments)
         launch_field_of_worlds(system.external_field, self._first, self._base)
         if self._source_field is not None:
-            system.sources.packed.pack(system.positions, system.moments)  # a resting world's are not
+            system.sources.packed.pack(system.positions, system.moments, resting=True)
             self._source_field.launch()
         self._field.launch()
         launch_flux_density(self.points, targets, self._moments, self.h, self.b)

@@ -78,6 +78,8 @@ class MomentSystem:
             unless a world has several bodies of ``couplings``.
         resting: 1 for worlds that :meth:`solve` leaves out, with their moments as they are, shape [worlds]; only the
             dynamics ``theta`` has them. The caller may write it.
+        refresh: Function that launches the update of ``moments`` in worlds that rest, where other moments stand for
+            them; None without such moments.
         rotations: Rotation of each body of ``couplings`` from its frame to the world's (x, y, z, w), shape [bodies];
             written by the caller before :meth:`solve`. None without ``couplings``.
         sources: ``sources`` and ``solids`` on the device; the caller writes their poses and strengths before
@@ -132,7 +134,8 @@ class MomentSystem:
         self.device, self.dtype = resolve_device(device), resolve_dtype(dtype)
         settings.check(dtype)
         layout = with_cells(make_layout(radii, worlds, permanent, bodies, movable, self.dtype), couplings)
-        self.eddy, self._ranks, self._graph = None, current_ranks(), None
+        self.eddy, self._ranks, self._graph, self._permanent_fields = None, current_ranks(), None, None
+        self.refresh: Callable[[], None] | None = None
         near, theta = settings.contact_model == "multipole", settings.dynamics == "theta"
         self._allocate(layout, external_field)
         material = material or MomentMaterial()
@@ -147,7 +150,6 @@ class MomentSystem:
         if self._cells is not None and solids:
             self._include_cells(couplings, {solid.first for solid in solids}, susceptibility)
         self._make_wrench(layout, rotatable)
-        self._permanent_fields = None
         self._near = self._make_near_contacts(layout, rotatable, susceptibility, faces) if near else None
         limits = float(settings.rtol), int(settings.max_evaluations)
         solve_state.bind(self._induction, self._packed, self.material, self.moments, *limits)

@@ -100,6 +100,7 @@ class DistantMagnets:
         self._choice = self._make_choice(np.isin(np.arange(len(many.system.world_ranges)), worlds[list(bodies)]))
         few_arrays, many_arrays = (self._arrays(placed, bodies) for placed in (self.few, many))
         self._launches = DistantLaunches(self._bodies, self._choice, many_arrays, few_arrays)
+        many.system.refresh = self._launches.spread_moments
         self._resting = RestingWorlds(many.system) if len(many.system.world_ranges) > 1 else None
 
     @property
@@ -194,10 +195,6 @@ class DistantMagnets:
             self._resting.leave_out()
         self._many.system.solve()
         self._launches.finish_many()
-
-    def spread_moments(self) -> None:
-        """Launch the moments of cells where they rest, which follow from the few moments of the last solve."""
-        self._launches.spread_moments()
 
     def add_forces(self, state: newton.State) -> None:
         """Launch the forces of the last solve, and add them to ``state.body_f``."""

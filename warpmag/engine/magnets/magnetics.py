@@ -63,8 +63,8 @@ class Magnetics:
 
     Attributes:
         magnets: The magnets, in the order of their moments.
-        system: The moments on the device. Where bodies act by few moments, its own are those of the last
-            :meth:`sum_moments` or measurement.
+        system: The moments on the device. Where bodies act by few moments, call its ``refresh`` before its ``moments``
+            are read; measurements of fields and :meth:`sum_moments` do so.
         shapes: Indices of the magnetic shapes, in the order of :meth:`shape_moments`, shape [n].
         shape_volumes: Magnetic volume of each of these shapes [m³], shape [n]. Where shapes of one body overlap, the
             common volume belongs to the first of them.
@@ -515,8 +515,7 @@ class Magnetics:
         context = CallContext(self.system.device, self.system.dtype, warp_out=False)
         points = context.vectors("points", points, farthest=largest_coordinate(self.system.dtype, largest))
         indices = self._world_indices(worlds, len(points))
-        prepare = None if self._distant is None else self._distant.spread_moments
-        probe = FieldProbe(self.system, len(points), worlds=indices, gradients=gradients, prepare=prepare)
+        probe = FieldProbe(self.system, len(points), worlds=indices, gradients=gradients)
         wp.copy(probe.points, points)
         return probe
 
@@ -611,8 +610,8 @@ class Magnetics:
 
     def sum_moments(self) -> wp.array:
         """Return :meth:`shape_moments` as a Warp array, which the next call overwrites; capturable in a graph."""
-        if self._distant is not None:
-            self._distant.spread_moments()
+        if self.system.refresh is not None:
+            self.system.refresh()
         sum_moments(self._first_moments_on_device, self.system.moments, self._shape_totals)
         return self._shape_totals
 
