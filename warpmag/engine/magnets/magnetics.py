@@ -9,7 +9,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warpmag.declarations import materials
-from warpmag.declarations.checks import check_positive, check_vector, check_whole, short_repr
+from warpmag.declarations.checks import check_positive, check_whole, short_repr
 from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.magnets import MagneticSettings, check_magnetization
 from warpmag.deprecation import renamed_arguments
@@ -22,16 +22,15 @@ from warpmag.engine.magnets.imported_field import imported_field
 from warpmag.engine.magnets.model_values import ModelValues, magnetic_arrays
 from warpmag.engine.magnets.placed_moments import PlacedMoments
 from warpmag.engine.magnets.pose_gradients import ForceGradients
+from warpmag.engine.magnets.shape_moments import PermanentShapes, ShapeMoments
 from warpmag.engine.magnets.sources import ModelSources
 from warpmag.engine.magnets.workload import Workload, workload
-from warpmag.engine.magnets.world_reset import WorldMask, WorldRows
+from warpmag.engine.magnets.world_reset import WorldStart
 from warpmag.errors import ConvergenceWarning, InputError, warn_caller
 from warpmag.kernels.rigid.bodies import (
     set_external_field,
     set_magnetization,
-    sum_moments,
 )
-from warpmag.kernels.rigid.worlds import choose
 from warpmag.moments.arrays import (
     CallContext,
     Numbers,
@@ -137,9 +136,13 @@ class Magnetics:
             self._distant = DistantMagnets(model, placed, bodies, settings, **options)
         self._sources.bind(self.system)
         self.coils = self._sources.circuits
-        self._map_shapes()
+        self._shape_moments = ShapeMoments(model, self.magnets, placed.volumes)
+        self.shapes, self.shape_volumes = self._shape_moments.shapes, self._shape_moments.volumes
+        self._permanent_shapes = PermanentShapes(model, self.magnets)
+        newton_worlds = np.maximum(self._worlds, 0)[self.system.worlds]
+        self._newton_world = wp.array(newton_worlds, dtype=wp.int32, device=model.device)
         self._gradients = ForceGradients(self.system, placed.table, self._sources, model, placed.coupled_bodies)
-        self._prepare_reset()
+        self._start = WorldStart(model, self._worlds, self.system)
         set_conductivities(model, self.magnets, self.system, float(dt))
         if imported is not None:
             self.set_external_field(imported)
@@ -212,40 +215,6 @@ class Magnetics:
             held.check()
         check_state(state, self._model, *names, *(("body_qd",) if self.needs_velocities else ()))
 
-    def _map_shapes(self) -> None:
-        """Copy the moments of each shape, and the permanent shapes of each body, to the device."""
-        device, volumes = self._model.device, self._placed.volumes
-        self.shapes = np.concatenate([magnet.shapes for magnet in self.magnets])
-        counts = np.concatenate([magnet.lattice.counts for magnet in self.magnets])
-        self._first_moments = np.concatenate([[0], np.cumsum(counts)])
-        self.shape_volumes = np.diff(np.concatenate([[0.0], np.cumsum(volumes)])[self._first_moments])
-
-        def put(values):
-            return wp.array(np.ascontiguousarray(values), dtype=wp.int32, device=device)
-
-        self._first_moments_on_device = put(self._first_moments)
-        self._shape_totals = wp.zeros(len(self.shapes), dtype=wp.vec3, device=device)
-        self._newton_world = put(np.maximum(self._worlds, 0)[self.system.worlds])
-        permanent = [magnet.magnet.kind == "permanent" for magnet in self.magnets for _ in magnet.shapes]
-        shape_body = self._model.shape_body.numpy()
-        shapes = self.shapes[np.array(permanent)]
-        shapes = shapes[np.argsort(shape_body[shapes], kind="stable")]
-        self._permanent_shapes, self._permanent_list = shapes, put(shapes)
-        self._permanent_bodies = shape_body[shapes]
-
-    def _prepare_reset(self) -> None:
-        """Copy the values to which :meth:`reset` returns."""
-        model, attributes = self._model, getattr(self._model, NAMESPACE)
-        self._mask, shape_worlds = WorldMask(model), model.shape_world.numpy()[: model.shape_count]
-        self._system_worlds = wp.array(self._worlds, dtype=wp.int32, device=model.device)
-        self._chosen_worlds = wp.zeros_like(self._system_worlds)
-        self._initial_values = [
-            WorldRows(attributes.magnetization, shape_worlds),
-            WorldRows(attributes.strength, shape_worlds),
-            WorldRows(attributes.voltage, shape_worlds),
-            WorldRows(self.external_field, self._worlds[self.system.worlds]),
-        ]
-
     def reset(self, worlds: Any = None) -> None:
         """Start worlds again, as after :class:`Magnetics` was made; capturable in a graph with an array on the device.
 
@@ -265,14 +234,11 @@ class Magnetics:
         Raises:
             InputError: ``worlds`` is not such a mask.
         """
-        self._mask.set(worlds)
-        for rows in self._initial_values:
-            rows.restore(self._mask)
+        mask, chosen = self._start.restore(worlds)
         if self.coils is not None:
-            self.coils.reset(self._mask)
-        choose(self._mask.array, self._system_worlds, self._chosen_worlds)
+            self.coils.reset(mask)
         for system in self._systems:
-            system.start_cold(self._chosen_worlds)
+            system.start_cold(chosen)
 
     def apply(self, state: newton.State, dt: float | None = None) -> None:
         """Add the magnetic forces at the poses of ``state`` to ``state.body_f``; capturable in a graph.
@@ -471,14 +437,7 @@ class Magnetics:
             magnetization = host_array("magnetization", magnetization)
             if magnetization.shape == (3,):
                 check_magnetization("magnetization", magnetization)
-        check_whole("body", body)
-        if shape is not None:
-            check_whole("shape", shape)
-        selected = self._permanent_bodies == body if shape is None else self._permanent_shapes == shape
-        rows = np.flatnonzero(selected)
-        if not len(rows) or (shape is None and body < 0):
-            raise InputError(f"set_magnetization: {'body' if shape is None else 'shape'} has no permanent magnet")
-        shapes = self._permanent_list[int(rows[0]) : int(rows[-1]) + 1]
+        shapes = self._permanent_shapes.select(body, shape)
         set_magnetization(self._vectors("magnetization", magnetization, (1,)), shapes, self._model, self._placed.table)
 
     def _vectors(self, name: str, value, counts: tuple[int, ...]) -> wp.array:
@@ -612,8 +571,7 @@ class Magnetics:
         """Return :meth:`shape_moments` as a Warp array, which the next call overwrites; capturable in a graph."""
         if self.system.refresh is not None:
             self.system.refresh()
-        sum_moments(self._first_moments_on_device, self.system.moments, self._shape_totals)
-        return self._shape_totals
+        return self._shape_moments.sum(self.system.moments)
 
     def moments_at(self, state: newton.State) -> np.ndarray:
         """Return the total equilibrium moments at a state; present fields and later steps are not affected.
@@ -656,19 +614,8 @@ class Magnetics:
         Raises:
             InputError: A shape has no magnet, or a magnetization is not three finite numbers.
         """
-        if not isinstance(magnetizations, dict):
-            raise InputError(f"magnetizations: must be a dictionary by shape, got {short_repr(magnetizations)}")
-        own_shapes = self.shapes.tolist()
-        for shape, magnetization in magnetizations.items():
-            if shape not in own_shapes:
-                raise InputError(f"magnetizations: shape {short_repr(shape)} has no magnet")
-            check_vector(f"magnetizations: shape {shape}", magnetization)
-        start = np.zeros((len(self._placed.volumes), 3))
         inducible = ~self._placed.table.permanent.numpy()
-        for part, shape in enumerate(own_shapes):
-            rows = slice(self._first_moments[part], self._first_moments[part + 1])
-            if shape in magnetizations and inducible[rows].all():
-                start[rows] = magnetizations[shape]
+        start = self._shape_moments.spread(magnetizations, inducible)
         self.system.start_from(wp.array(start, dtype=wp.vec3, device=self._model.device))
 
 

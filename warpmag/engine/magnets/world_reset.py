@@ -7,10 +7,12 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warpmag.declarations.attributes import NAMESPACE
 from warpmag.declarations.checks import short_repr
 from warpmag.errors import InputError
-from warpmag.kernels.rigid.worlds import complete_mask, restore_rows
+from warpmag.kernels.rigid.worlds import choose, complete_mask, restore_rows
 from warpmag.moments.arrays import check_warp_array
+from warpmag.moments.system import MomentSystem
 
 
 class WorldMask:
@@ -82,6 +84,35 @@ class WorldRows:
     def restore(self, mask: WorldMask) -> None:
         """Launch the return of the rows of chosen worlds."""
         restore_rows(mask.array, self._worlds, self._saved, self._rows)
+
+
+class WorldStart:
+    """Values of the magnets of a model that return where worlds start again."""
+
+    def __init__(self, model: newton.Model, worlds: np.ndarray, system: MomentSystem):
+        """Copy the present values; ``worlds`` are Newton's numbers of the worlds of ``system``."""
+        attributes, shape_worlds = getattr(model, NAMESPACE), model.shape_world.numpy()[: model.shape_count]
+        self._mask = WorldMask(model)
+        self._worlds = wp.array(worlds, dtype=wp.int32, device=model.device)
+        self._chosen = wp.zeros_like(self._worlds)
+        self._values = [
+            WorldRows(attributes.magnetization, shape_worlds),
+            WorldRows(attributes.strength, shape_worlds),
+            WorldRows(attributes.voltage, shape_worlds),
+            WorldRows(system.external_field, worlds[system.worlds]),
+        ]
+
+    def restore(self, worlds: Any) -> tuple[WorldMask, wp.array]:
+        """Launch the return of the values of ``worlds``, as of :meth:`WorldMask.set`.
+
+        Returns:
+            The mask, and 1 for each of the system's worlds that starts again, else 0, shape [worlds of the system].
+        """
+        self._mask.set(worlds)
+        for rows in self._values:
+            rows.restore(self._mask)
+        choose(self._mask.array, self._worlds, self._chosen)
+        return self._mask, self._chosen
 
 
 def _bytes_of(array: wp.array) -> wp.array:
