@@ -315,9 +315,9 @@ EXPECTED = {
     "balls": {
         "sum_and_finish",
         "begin_flow",
-        "sweep",
+        "sweep_moment",
         "check_convergence",
-        "advance",
+        "advance_moment",
         "add_eddy_moments",
         "eddy_passes",
     },
@@ -326,13 +326,13 @@ EXPECTED = {
     "near": {"sum_tile", "make_passes", "begin_flow"},
     "turned": {"sum_tile", "finish", "begin_flow"},
     "yielding": {"sum_tile", "finish", "begin_flow", "add_bias"},
-    "cells": {"sum_and_finish", "add_couplings", "sweep"},
+    "cells": {"sum_and_finish", "add_couplings", "sweep_moment"},
     "whole": {"sum_and_finish", "add_couplings", "respond_all"},
     "images": {"make_passes", "add_couplings", "add_reactions"},
     "coils": {"sum_tile", "apply_sources", "add_forces", "add_to_probe", "add_eddy_moments"},
     "solids": {"sum_and_finish", "apply_sources", "add_forces", "add_to_probe", "add_eddy_moments"},
     "fast": {"build_octree", "sum_leaf", "translate_block", "add_parts", "expansion_step", "return_sums"},
-    "most": {"sum_mirrored", "finish", "sweep", "list_neighbors"},
+    "most": {"sum_mirrored", "finish", "sweep_moment", "list_neighbors"},
 }
 """Kernels that a system must launch on a GPU."""
 
@@ -357,12 +357,12 @@ def test_systems(which, launches):
         threads.setdefault(launch.name, set()).add(launch.threads)
     assert EXPECTED[which] <= threads.keys()
     induced = sum(middle - first for first, middle, _ in ranges)
-    if "sweep" in threads:
-        assert threads["sweep"] == {8 * induced}  # a group per moment
-    if "advance" in threads:
-        assert threads["advance"] == {induced}
+    if "sweep_moment" in threads:
+        assert threads["sweep_moment"] == {8 * induced}  # a group per moment
+    if "advance_moment" in threads:
+        assert threads["advance_moment"] == {induced}
     chunks = sum(-(-(middle - first) // BLOCK_CHUNK) for first, middle, _ in ranges)
-    block = max(32, largest_chunk(driven._induction)) if "advance" in threads else BLOCK_CHUNK
+    block = max(32, largest_chunk(driven._induction)) if "advance_moment" in threads else BLOCK_CHUNK
     assert threads["check_convergence"] == {block * chunks}
 
 
@@ -385,7 +385,7 @@ def test_simulation(launches):
     """A step of balls on the ground below a magnet."""
     advance(magnets())
     threads = {launch.name: launch.threads for launch in launches}
-    assert threads["advance"] == threads["_move"] == 2
+    assert threads["advance_moment"] == threads["_move"] == 2
     assert {
         "_watch",
         "_end_attempt",

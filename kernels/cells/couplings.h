@@ -5,6 +5,7 @@
 // vector of cells, on a GPU a group of threads has one cell. ``Couplings`` is the struct of couplings.py.
 #pragma once
 #include "cells/rotation.h"
+#include "shared/active.h"
 #include "shared/group.h"
 #include "shared/team.h"
 
@@ -111,7 +112,8 @@ template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Coupli
 template <class Word, class Couplings>
 CUDA_CALLABLE inline void add_couplings(int thread, int first, int last, int threads, Word* team, const Couplings& c) {
 #if defined(__CUDA_ARCH__)
-    make_cell_pass(c, first, thread / GROUP);
+    const int n = thread / GROUP, chunk = active_item(c.active, n / CHUNK);
+    if (chunk >= 0) make_cell_pass(c, first, CHUNK * chunk + n % CHUNK);
 #else
     run_passes(team, threads, first, last, CHUNK * c.chunk.shape[0], WIDTH,
                [&](int pass, int row) { make_cell_pass(c, pass, row); });

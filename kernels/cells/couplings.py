@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
-from warpmag.kernels.shared.reductions import group_threads
+from warpmag.kernels.shared.reductions import group_threads, most_blocks
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
 COMMON = 8  # low-order fields that all cells of a body share: three uniform and five linear ones; as in ``couplings.h``
@@ -33,6 +33,7 @@ def couplings_type(dtype):
         position: wp.array2d[dtype]  # positions of cells for the low-order fields of their body, shape [3, rows]
         # Model: bodies
         chunk: wp.array[wp.vec4i]  # first moment, count, first row of the body, first row of its table, shape [chunks]
+        active: wp.array[int]  # on a GPU the number of chunks that are summed, then these; None for all
         body: wp.array[int]  # body of a chunk, shape [chunks]
         rows: wp.array[wp.vec2i]  # range of rows of each body, shape [bodies]
         matrix: wp.array[dtype]  # COMMON × COMMON matrix from moments to low-order coefficients [1/m³], per body
@@ -96,13 +97,26 @@ class CellCouplings:
         other_chunks = self._lay_out(bodies, collective, dtype, h.device)
         self.chunks = c.chunk
         self.rotations, self.entries = c.rotation, sum(len(coupling.other) for _, coupling in bodies)
-        self._launches, self._others = self._record_field(c), []
+        self._part = None
         if other_chunks:
-            part = couplings_type(dtype)()
+            self._part = part = couplings_type(dtype)()
             for name in couplings_type(dtype).vars:
                 setattr(part, name, getattr(c, name))
             part.chunk = c.chunk[:other_chunks]
-            self._others = self._record_field(part)
+        self._record_all()
+
+    def _record_all(self):
+        self._launches = self._record_field(self._couplings)
+        self._others = [] if self._part is None else self._record_field(self._part)
+
+    def sum_active(self, list_active):
+        """Sum only chunks of worlds that do not rest from now on, on a GPU.
+
+        ``list_active`` returns for chunks, a Warp array, their list on the device: a number, then indices.
+        """
+        for couplings in filter(None, (self._couplings, self._part)):
+            couplings.active = list_active(couplings.chunk)
+        self._record_all()
 
     def _record_field(self, couplings):
         on_gpu = couplings.h.device.is_cuda
@@ -114,6 +128,7 @@ class CellCouplings:
         device, rows = couplings.h.device, CHUNK * couplings.chunk.shape[0]
         group = group_threads(device)
         sizes = dict(threads=threads_for(rows, _CELLS_PER_THREAD), gpu_threads=group * rows)
+        sizes["max_blocks"] = most_blocks(device) if couplings.active else 0
         kernel = _kernel(couplings.tensor.dtype, group)
         return launch_passes(kernel, first, last + 1, couplings, device=device, record_cmd=True, **sizes)
 

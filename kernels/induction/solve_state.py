@@ -67,6 +67,7 @@ def state_type(dtype):
         rtol: wp.float64  # error at which a world ends
         max_evaluations: int  # field evaluations after which a world ends unconverged
         row: wp.array[wp.vec4i]  # moment, world, and range of the world's inducible moments, shape [m]
+        active: wp.array[int]  # on a GPU the number of rows whose worlds do not rest, then these; None for all
         chunk: wp.array[wp.vec3i]  # range of rows, and world, of each chunk, shape [c]
         chunk_begin: wp.array[int]  # first chunk of each world, shape [w + 1]
         near: wp.array3d[int]  # on a CPU rows of the neighbors of a chunk's moments, shape [c, CAPACITY, CHUNK]

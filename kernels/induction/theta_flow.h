@@ -8,6 +8,7 @@
 #include "induction/theta_step.h"
 #include "material/curves.h"
 #include "pairs/neighbor_lists.h"
+#include "shared/active.h"
 #include "shared/group.h"
 #include "shared/team.h"
 
@@ -234,7 +235,6 @@ template <class State> CUDA_CALLABLE inline void start(State& state, const Span&
 
 // Sweeps once over the neighbors' changes of moment, s ← s + ω' (ḡ + (k/Ms) G' ΔM − s). The last sweep stores moments.
 template <class State> CUDA_CALLABLE inline void sweep(State& state, const Span& at, bool last) {
-    if (at.row == 0 && share() == 0) state.condition.data[0] = 0; // worlds that iterate on set it again
     const auto& world = state.worlds.data[at.world];
     if (world.next != STEP_AND_SWEEP) return;
     Real* const from = last ? state.swept.data : state.now.data;
@@ -371,6 +371,17 @@ template <class State> CUDA_CALLABLE inline void advance(State& state, const Spa
 }
 
 #if defined(__CUDA_ARCH__)
+// Sweeps over the n-th of the moments whose worlds do not rest.
+template <class State> CUDA_CALLABLE inline void sweep_moment(State& state, int n, bool last) {
+    if (n == 0 && share() == 0) state.condition.data[0] = 0; // worlds that iterate on set it again
+    const int row = active_item(state.active, n);
+    if (row >= 0) sweep(state, span_at(state, row), last);
+}
+template <class State> CUDA_CALLABLE inline void advance_moment(State& state, int n) {
+    const int row = active_item(state.active, n);
+    if (row >= 0) advance(state, span_at(state, row));
+}
+
 // Terms of the moment at ``row`` in the sums of its world.
 template <class State> CUDA_CALLABLE inline wp::vec_t<COLUMNS, double> world_sums(State& state, int row) {
     wp::vec_t<COLUMNS, double> sums;
@@ -409,6 +420,7 @@ template <class State> inline void run_pass(State& state, int pass, int row) {
         start(state, at);
         if (row == CHUNK * state.chunk_begin.data[at.world]) begin_world(state, at.world);
     } else if (pass == FIRST_SWEEP || pass == LAST_SWEEP) {
+        if (row == 0) state.condition.data[0] = 0; // worlds that iterate on set it again
         sweep(state, at, pass == LAST_SWEEP);
     } else if (pass == MEASURE) {
         if (world.active) measure_vector(state, at);

@@ -59,7 +59,7 @@ from warpmag.kernels.material.curves import inverse_curve_ratio
 from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel, native_options
-from warpmag.kernels.shared.reductions import group_threads
+from warpmag.kernels.shared.reductions import group_threads, most_blocks
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, launch_passes, threads_for
 
 START, FIRST_SWEEP, LAST_SWEEP, MEASURE, CHOOSE, ADVANCE = range(6)  # passes in order; as in ``theta_flow.h``
@@ -115,7 +115,7 @@ def _begin_kernel(dtype, group: int, responding: bool, blocks: int):
 
 @cache
 def _sweep_kernel(dtype, group: int, responding: bool):
-    call = "sweep(state, warpmag::span_at(state, thread / warpmag::GROUP), last == 1)"
+    call = "sweep_moment(state, thread / warpmag::GROUP, last == 1)"
     arguments, constants = {"last": int, "state": state_type(dtype)}, _constants(group, responding)
     launch = {"launch_bounds": (256, _RESIDENT_BLOCKS[dtype][1])}
     return native_kernel(call, "induction/theta_flow.h", arguments, dtype=dtype, launch=launch, **constants)
@@ -155,7 +155,7 @@ def _convergence_kernel(dtype, group: int, responding: bool):
 
 @cache
 def _advance_kernel(dtype, group: int, responding: bool):
-    call, arguments = "advance(state, warpmag::span_at(state, thread))", {"state": state_type(dtype)}
+    call, arguments = "advance_moment(state, thread)", {"state": state_type(dtype)}
     return native_kernel(call, "induction/theta_flow.h", arguments, dtype=dtype, **_constants(group, responding))
 
 
@@ -189,8 +189,8 @@ class Launches:
         device, dtype, count, chunks = state.h.device, state.packed.dtype, state.row.shape[0], state.chunk.shape[0]
         group, responding = group_threads(device), bodies is not None
 
-        def record(kernel, dim, *inputs, block_dim=256):
-            options = dict(block_dim=block_dim, device=device, record_cmd=True)
+        def record(kernel, dim, *inputs, block_dim=256, max_blocks=0):
+            options = dict(block_dim=block_dim, max_blocks=max_blocks, device=device, record_cmd=True)
             return wp.launch(kernel, dim=dim, inputs=[*inputs, state], **options)
 
         def passes(first: int, last: int):
@@ -205,10 +205,12 @@ class Launches:
             blocks, block_dim = -(-group * largest // _START_THREADS), max(32, largest)
             width, begin = group * largest // blocks, _begin_kernel(dtype, group, responding, blocks)
             self.begin = [record(begin, (blocks * chunks, width), block_dim=width)]
-            self.sweeps = [record(_sweep_kernel(dtype, group, responding), group * count, last) for last in (0, 1)]
+            most = most_blocks(device) if state.active else 0
+            sweep = _sweep_kernel(dtype, group, responding)
+            self.sweeps = [record(sweep, group * count, last, max_blocks=most) for last in (0, 1)]
             self.iteration = [
                 record(_convergence_kernel(dtype, group, responding), (chunks, block_dim), block_dim=block_dim),
-                record(_advance_kernel(dtype, group, responding), count),
+                record(_advance_kernel(dtype, group, responding), count, max_blocks=most),
             ]
         if bodies is not None:
             self.begin.append(bodies.begin)

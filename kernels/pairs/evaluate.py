@@ -29,7 +29,7 @@ from warpmag.kernels.pairs.reference import launch_reference_sums
 from warpmag.kernels.pairs.work_list import PAIRS_PER_THREAD
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
-from warpmag.kernels.shared.reductions import group_threads
+from warpmag.kernels.shared.reductions import group_threads, most_blocks
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
 LOOP, FUSED, SHORT, MIRRORED, REFERENCE, GIVEN = "loop", "fused", "short", "mirrored", "reference", "given"
@@ -74,7 +74,6 @@ class PairEvaluation:
         form: ``LOOP``, ``FUSED``, ``SHORT``, ``MIRRORED``, ``REFERENCE`` or ``GIVEN``.
         count: Number of target rows.
         target: Packed column of each target row, shape [count].
-        row_end: End of the sources of each target row; a GPU leaves out rows with -1, shape [count].
         tiles: Work list on the device (``work_list``), shape [tiles, TILE_COLUMNS].
         pair_count: Number of pairs of a target and a source.
         partial: Partial sums, shape [parts, rows, sums]; the caller's ``extra_parts`` are last.
@@ -93,8 +92,7 @@ class PairEvaluation:
             segments = segments[:1, [2, 3, 2, 3]]
         self._arrays = a = work_list.arrays_type(dtype)()
         a.target, a.begin, a.end = work_list.target_rows(segments, device)
-        self.target, self.row_end, self.count = a.target, a.end, a.target.shape[0]
-        self.pair_count = work_list.pair_count(segments)
+        self.target, self.count, self.pair_count = a.target, a.target.shape[0], work_list.pair_count(segments)
         shared = self.form in (LOOP, MIRRORED) and self.pair_count >= _LEAST_SHARED["cuda" if device.is_cuda else "cpu"]
         self._ranks = ranks if shared else None
         self._finished = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity
@@ -167,11 +165,17 @@ class PairEvaluation:
             # the threads that summed are awake, and a row whose overlap list is full visits all its sources
             self._launch_pass(finish, threads_for(self.pair_count, PAIRS_PER_THREAD))
 
+    def finish_active(self, active):
+        """Finish only the rows in ``active`` from now on, on a GPU: their number, then the rows, shape [count + 1]."""
+        self._arrays.active = active
+        self._recorded.clear()
+
     def _launch_pass(self, kernel, threads):
         """Launch a pass over the target rows. The launch is recorded, so that the struct is packed only once."""
         if kernel not in self._recorded:
             device = self.partial.device
             sizes = dict(threads=threads, gpu_threads=group_threads(device) * self.count)
+            sizes["max_blocks"] = most_blocks(device) if self._arrays.active else 0
             self._recorded[kernel] = launch_passes(kernel, 0, 1, self._arrays, device=device, record_cmd=True, **sizes)
         self._recorded[kernel].launch()
 

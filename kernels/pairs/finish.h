@@ -7,6 +7,7 @@
 #include "pairs/neighbor_lists.h"
 #include "pairs/pair_law.h"
 #include "pairs/pair_terms.h"
+#include "shared/active.h"
 #include "shared/group.h"
 #include "shared/team.h"
 
@@ -144,8 +145,8 @@ template <Quantity Q, class Arrays> CUDA_CALLABLE inline void finish_rows(const 
 template <Quantity Q, class Word, class Arrays>
 CUDA_CALLABLE inline void finish(int thread, int threads, Word* team, const Arrays& arrays) {
 #if defined(__CUDA_ARCH__)
-    const int row = thread / GROUP;
-    if (arrays.end.data[row] >= 0) finish_rows<Q>(arrays, row); // else of a world that rests
+    const int row = active_item(arrays.active, thread / GROUP);
+    if (row >= 0) finish_rows<Q>(arrays, row);
 #else
     run_passes(team, threads, 0, 1, arrays.target.shape[0], WIDTH, [&](int, int i) { finish_rows<Q>(arrays, i); });
 #endif

@@ -6,9 +6,10 @@
 
 namespace warpmag {
 
-template <Quantity Q, class Arrays> CUDA_CALLABLE inline void sum_and_finish_row(const Arrays& arrays, int row) {
+template <Quantity Q, class Arrays> CUDA_CALLABLE inline void sum_and_finish_row(const Arrays& arrays, int n) {
+    const int row = active_item(arrays.active, n);
+    if (row < 0) return;
     const TargetRows at = target_rows(arrays, row);
-    if (at.end < 0) return; // of a world that rests
     constexpr bool FIELD = Q == Quantity::FIELD;
     const Table targets(arrays.targets), sources(arrays.sources);
     const Moment target = targets.moment(at.i);

@@ -205,6 +205,7 @@ def arrays_type(dtype):
         end: wp.array[int]
         tiles: wp.array2d[int]
         shares: wp.array[int]  # first tile of each share of a CPU, and the end
+        active: wp.array[int]  # on a GPU the number of rows to finish, then these; None for all
         same_set: int  # 1 if targets and sources are the same moments
         with_torque: wp.array[int]  # 1 where a torque is computed
         # Data in:

@@ -1,4 +1,4 @@
-"""Work lists whose entries belong to worlds: those of worlds that rest become empty."""
+"""Work lists whose entries belong to worlds: entries of worlds that rest become empty, or are not listed."""
 
 import warp as wp
 
@@ -38,3 +38,22 @@ def record_leave_out(whole, world, resting, column: int, entries, *, begin: int 
     """
     inputs = [whole, world, resting, column, begin, empty]
     return wp.launch(_leave_out, len(whole), inputs, outputs=[entries], device=entries.device, record_cmd=True)
+
+
+@wp.kernel
+def _list_active(world_in: wp.array[int], resting_in: wp.array[int], active_out: wp.array[int]):
+    item = wp.tid()
+    if resting_in[world_in[item]] == 0:
+        active_out[wp.atomic_add(active_out, 0, 1) + 1] = item
+
+
+def record_list_active(world, resting, active) -> wp.Launch:
+    """Return a launch that lists the items of worlds that do not rest, in any order.
+
+    Args:
+        world: World of each item, shape [items].
+        resting: Not 0 for worlds that rest, shape [worlds].
+        active: Out, number of listed items, which must be 0 before, then the items, shape [items + 1].
+    """
+    inputs = [world, resting]
+    return wp.launch(_list_active, len(world), inputs, outputs=[active], device=active.device, record_cmd=True)

@@ -7,10 +7,17 @@ import warp as wp
 
 _GROUP_THREADS = 8  # threads of a GPU that share the neighbors of a moment; a power of two, at most a warp
 
+_BLOCKS = 16  # per multiprocessor of a GPU, in launches over lists
+
 
 def group_threads(device) -> int:
     """Number of threads that share the neighbors of a moment: ``_GROUP_THREADS`` on a GPU, 1 on a CPU."""
     return _GROUP_THREADS if device.is_cuda else 1
+
+
+def most_blocks(device) -> int:
+    """Most blocks of a launch over a list whose length is known to the device alone; threads repeat beyond them."""
+    return _BLOCKS * device.sm_count if device.is_cuda else 0
 
 
 @cache

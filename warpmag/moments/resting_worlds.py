@@ -5,7 +5,7 @@ import warp as wp
 
 from warpmag.kernels.applied.fields import AppliedForces
 from warpmag.kernels.pairs.evaluate import FUSED, LOOP
-from warpmag.kernels.shared.leave_out import record_leave_out
+from warpmag.kernels.shared.leave_out import record_leave_out, record_list_active
 from warpmag.moments.system import MomentSystem
 
 _TILE_ROWS, _TILE_SOURCES = {"column": 1, "begin": 0}, {"column": 4, "begin": 3}
@@ -29,6 +29,7 @@ class RestingWorlds:
     def __init__(self, system: MomentSystem):
         """Copy the work lists of ``system``."""
         self._system, self._launches, self._kept = system, [], []
+        self._lists: dict[bytes, wp.array] = {}
         worlds, on_gpu = system.worlds, system.device.is_cuda
         self._add(system._packed.active_groups, worlds, _NONE)
         evaluations = [system._permanent_field, system._inducible_field]
@@ -36,12 +37,27 @@ class RestingWorlds:
         for evaluation in evaluations:
             if evaluation.form in (LOOP, FUSED):
                 self._add(evaluation.tiles, worlds[_column(evaluation.tiles, 2)], _TILE_ROWS, _TILE_SOURCES)
-            if on_gpu and evaluation.form != FUSED:  # on a CPU vectors of rows belong to several worlds
-                self._add(evaluation.row_end, worlds[evaluation.target.numpy()], _NONE)
-        if system._cells is not None:
+            if on_gpu and evaluation.form != FUSED:
+                evaluation.finish_active(self._list(evaluation.target))
+        if on_gpu:
+            system._induction.active = self._list(system._induction.row)
+        if system._cells is not None and on_gpu:
+            system._cells.sum_active(self._list)
+        elif system._cells is not None:
             self._add(system._cells.chunks, worlds[_column(system._cells.chunks, 0)], _COUNT)
         if system.source_interaction is not None:
             self._add_sources(system.source_interaction)
+
+    def _list(self, entries: wp.array) -> wp.array:
+        """Return a list of the entries, each with a moment in its first column, that belong to no resting world."""
+        moments = _column(entries, 0)
+        if (key := moments.tobytes()) not in self._lists:
+            device = self._system.device
+            self._lists[key] = active = wp.zeros(len(moments) + 1, dtype=wp.int32, device=device)
+            world = wp.array(self._system.worlds[moments], dtype=wp.int32, device=device)
+            if len(moments):
+                self._launches.append(record_list_active(world, self._system.resting, active))
+        return self._lists[key]
 
     def _add_sources(self, interaction: AppliedForces) -> None:
         """Add the lists of targets of sources, of cells near permanent bodies, and of reactions."""
@@ -65,6 +81,8 @@ class RestingWorlds:
 
     def leave_out(self) -> None:
         """Launch the removal of the worlds that rest, and the return of the others."""
+        for active in self._lists.values():
+            active[:1].zero_()
         for launch in self._launches:
             launch.launch()
 
