@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.shared.native import native_kernel
-from warpmag.kernels.shared.reductions import group_threads
+from warpmag.kernels.shared.reductions import group_threads, most_blocks
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
 
 CAPACITY = 64  # length of a list
@@ -122,15 +122,19 @@ def _kernel(call: str, header: str, dtype, capacity: int, group: int):
     return native_kernel(call, header, arguments, dtype=dtype, CAPACITY=capacity, GROUP=group, BLOCK=_BLOCK)
 
 
-def _launch(call: str, targets, sources, dim: int = 1):
-    """Launch ``dim`` threads that make a call of the device's header; on a CPU one thread shares it with the team."""
+def _launch(call: str, targets, sources, dim: int = 1, most: int = 0):
+    """Launch ``dim`` threads that make a call of the device's header; on a CPU one thread shares it with the team.
+
+    At most ``most`` blocks make several calls in each thread; 0 means that each thread makes one call.
+    """
     device = targets.packed.device
     header, threads, members = "pairs/neighbors_cuda.h", 0, None
     if device.is_cpu:
         header, members = "pairs/neighbors_cpu.h", team()
         threads = threads_for(targets.packed.shape[1], MOMENTS_PER_THREAD)
     kernel = _kernel(call, header, targets.packed.dtype, targets.neighbor.shape[1], group_threads(device))
-    wp.launch(kernel, dim=dim, inputs=[threads, members, targets, sources], device=device, block_dim=_BLOCK)
+    options = {"device": device, "block_dim": _BLOCK, "max_blocks": most}
+    wp.launch(kernel, dim=dim, inputs=[threads, members, targets, sources], **options)
 
 
 def launch_find_neighbors(targets, sources):
@@ -143,7 +147,9 @@ def launch_find_neighbors(targets, sources):
         _launch("search_neighbors(targets, sources, threads, team.data)", targets, sources)
         return
     _launch("fill_table(thread, targets, sources)", targets, sources, max(sources.packed.shape[1], 1))
-    _launch("list_neighbors(thread, targets, sources)", targets, sources, 32 * targets.packed.shape[1])
+    # in most steps nothing has moved too far, and a block for each four targets would only start and end
+    dim, most = 32 * targets.packed.shape[1], most_blocks(targets.packed.device)
+    _launch("list_neighbors(thread, targets, sources)", targets, sources, dim, most)
 
 
 def launch_list_overlaps(targets, sources):

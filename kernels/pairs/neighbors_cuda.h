@@ -40,6 +40,7 @@ template <class Lists> __device__ inline void list_neighbors(int thread, const L
     __shared__ int lists[BLOCK / 32][CAPACITY], counts[BLOCK / 32];
     int* const list = lists[threadIdx.x / 32];
     int& neighbors = counts[threadIdx.x / 32];
+    __syncwarp(); // a thread may list several targets, one after the other
     if (c == 0) neighbors = 0;
     __syncwarp();
     const bool same = targets.count.data == sources.count.data;
