@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from bench.reference import boxes, oracle
 from bench.systems import moment_system
 from warpmag.kernels.cells import cell_pairs
-from warpmag.shapes import demagnetization, lattice, uniform_response
+from warpmag.shapes import demagnetization, lattice, linear_cells, uniform_response
 
 FAINT = 1e12  # A/m, a saturation far above any field here
 TURN = np.array([0.2, -0.4, 0.1, 0.8]) / np.linalg.norm([0.2, -0.4, 0.1, 0.8])
@@ -68,16 +68,17 @@ def demagnetizing_matrix(body, coupling=None):
     t = (g1[..., None, None] * np.eye(3) + g2[..., None, None] * r[..., :, None] * r[..., None, :]) / (4 * math.pi)
     t[np.arange(n), np.arange(n)] = -np.eye(3) / (3.0 * body.volumes[:, None, None])
     i = np.repeat(np.arange(n), np.diff(coupling.start))
-    t[i, coupling.other] += full(coupling.tensor)
-    fields = demagnetization.common_fields(coupling.scaled_positions)
-    t += np.einsum("ipk,kl,jql->ijpq", fields, coupling.common, fields)
+    grid = Rotation.from_quat(coupling.grid_rotation).as_matrix()
+    t[i, coupling.other] += grid @ coupling.grid_tensor @ grid.T
+    t += coupling.common
     t *= -np.sqrt(body.volumes[:, None] * body.volumes)[..., None, None]
     return t.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
 
 
 def coupled(body, solids):
     """Coupling of a body's cells, as a model has it."""
-    return uniform_response.with_surface_response(demagnetization.coupling(body, body.radii), body, solids)
+    cells = linear_cells.with_slopes(demagnetization.coupling(body, body.radii), body)
+    return uniform_response.with_surface_response(cells, body, solids)
 
 
 def pair_corrections(bodies, couplings, poses):
@@ -88,4 +89,5 @@ def pair_corrections(bodies, couplings, poses):
         for x, half in zip(body.positions, coupling.half_sides, strict=True)
     ]
     labels = np.repeat(np.arange(len(bodies)), [len(body.volumes) for body in bodies])
-    return boxes.body_corrections(cells, labels, cell_pairs.WINDOW, cell_pairs.CLOSE, cell_pairs.HARDENING)
+    hardening = cell_pairs.HARDENING, cell_pairs.STEEPNESS
+    return boxes.body_corrections(cells, labels, cell_pairs.WINDOW, cell_pairs.CLOSE, *hardening)

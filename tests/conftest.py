@@ -19,7 +19,7 @@ UNDEFINED = (
 """What Clang's driver calls ``undefined``, of what kernels can do; the compiler inside Warp knows no groups."""
 QUICK = {
     *("structure", "oracle", "curves", "materials", "lattice", "harmonics", "pair_sums", "neighbors", "near_sums"),
-    *("eddy", "translation", "applied", "body_response", "baseline_dynamics", "system", "cells_compound", "coils"),
+    *("eddy", "translation", "applied", "baseline_dynamics", "system", "cells_compound", "coils"),
     *("engine_attributes", "engine_magnetics", "engine_simulation", "engine_xpbd", "stepping", "balls", "broad_phase"),
     *("ball_contacts", "coulomb", "near_contact_extremes", "usd_schemas", "usd_reader", "usd_crate", "usd_output"),
     *("export", "viewers", "observables"),

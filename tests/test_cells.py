@@ -1,7 +1,6 @@
 """Inducible bodies other than balls: demagnetizing tensors of their cells, moments, forces and torques."""
 
 import math
-from dataclasses import replace
 
 import magpylib
 import newton
@@ -26,7 +25,7 @@ from scipy.spatial.transform import Rotation
 import warpmag
 from bench.reference import oracle, plate, surface_integrals
 from bench.systems import moment_system
-from warpmag.shapes import demagnetization, lattice, uniform_response
+from warpmag.shapes import demagnetization, lattice, linear_cells, uniform_response
 
 SIDES = np.array([1.0, 0.7, 0.4])
 
@@ -74,8 +73,8 @@ def test_tensors_of_cuboids_add_up_to_that_of_the_block_they_fill():
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_field_of_cells_is_that_of_balls_and_couplings(device, dtype):
     body = lattice.fill(lattice.cylinder(0.01, 0.005), 0.003)
-    common = np.random.default_rng(1).normal(size=(8, 8)) / body.volumes.sum()
-    coupling = replace(demagnetization.coupling(body, body.radii), common=0.2 * (common + common.T))
+    coupling = linear_cells.with_slopes(demagnetization.coupling(body, body.radii), body)
+    assert len(body.volumes) >= linear_cells.LEAST_CELLS
     system = make_system(body, turn=TURN, coupling=coupling, dtype=dtype, device=device)
     start = np.random.default_rng(0).normal(size=body.positions.shape)
     system.start_from(wp.array(0.05 * FAINT * start, dtype=system.moments.dtype, device=device))
@@ -203,13 +202,13 @@ def test_cubes_approach_the_published_value(device):
     ids=lambda solid: f"{solid.name}{solid.upper.max() / solid.upper.min():.0f}",
 )  # fmt: skip
 def test_operator_of_a_body_is_positive(solid):
-    """Eigenvalues are in [0, 1], so that induction has one solution for any susceptibility."""
+    """Induction then has one solution for any susceptibility. Slopes add to the energy: eigenvalues may exceed 1."""
     body = lattice.fill(solid, (solid.volume / 150.0) ** (1 / 3))
     matrix = demagnetizing_matrix(body, coupled(body, [solid]))
     np.testing.assert_allclose(matrix, matrix.T, atol=1e-12)
     values = np.linalg.eigvalsh(matrix)
     assert values[0] > 0.0
-    assert values[-1] < 1.0
+    assert values[-1] < 1.1
 
 
 SLENDER = {
@@ -447,7 +446,7 @@ def test_response_of_cells_is_the_same_directly_and_by_iteration(name, monkeypat
     monkeypatch.setattr(uniform_response, "_MATRIX_CELLS", 0)
     monkeypatch.setattr(uniform_response, "_RESIDUAL", 1e-6)
     iterated = uniform_response.cell_polarizability(cells, body)
-    assert len(direct) == uniform_response.FIELD_COUNT
+    assert direct.shape == (3, 3)
     np.testing.assert_allclose(iterated, direct, atol=1e-10 * np.abs(direct).max())
 
 

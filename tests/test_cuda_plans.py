@@ -327,7 +327,7 @@ EXPECTED = {
     "turned": {"sum_tile", "finish", "begin_flow"},
     "yielding": {"sum_tile", "finish", "begin_flow", "add_bias"},
     "cells": {"sum_and_finish", "add_couplings", "sweep_moment"},
-    "whole": {"sum_and_finish", "add_couplings", "respond_all"},
+    "whole": {"sum_and_finish", "add_couplings", "sweep_moment"},
     "images": {"make_passes", "add_couplings", "add_reactions"},
     "coils": {"sum_tile", "apply_sources", "add_forces", "add_to_probe", "add_eddy_moments"},
     "solids": {"sum_and_finish", "apply_sources", "add_forces", "add_to_probe", "add_eddy_moments"},

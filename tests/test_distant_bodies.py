@@ -10,7 +10,7 @@ from warpmag.engine.magnets import magnetics as magnetics_module
 from warpmag.moments.arrays import restore_snapshot, take_snapshot
 from warpmag.moments.probe import FieldProbe
 from warpmag.shapes import demagnetization, distant_response, lattice
-from warpmag.shapes.softening import softened
+from warpmag.shapes.linear_cells import with_slopes
 from warpmag.shapes.uniform_response import cell_matrix, with_surface_response
 
 PLATE = (0.03, 0.03, 0.0015)
@@ -92,15 +92,17 @@ def force(points, moments, source, moment):
 def test_few_moments_respond_to_a_dipole_as_the_cells_do(solid, spacing):
     # the first polynomials without a response have degree 5; the largest of 150 differences is the stated error
     body = lattice.fill(solid, spacing, together=True)
-    coupling = with_surface_response(softened(demagnetization.coupling(body, body.radii), body), body, [solid])
+    coupling = with_surface_response(with_slopes(demagnetization.coupling(body, body.radii), body), body, [solid])
     few = distant_response.distant_body(body, coupling)
     assert few is not None
     root = np.repeat(np.sqrt(body.volumes), 3)
-    common = root[:, None] * demagnetization.common_fields(coupling.scaled_positions).reshape(len(root), -1)
-    solve = np.linalg.inv(cell_matrix(coupling, body) - common @ coupling.common @ common.T)
+    uniform = root[:, None] * np.tile(np.eye(3), (len(body.volumes), 1))
+    solve = np.linalg.inv(cell_matrix(coupling, body) - uniform @ coupling.common @ uniform.T)
     k = len(few.volumes)
     assert 3 < k <= distant_response.MOST_POINTS and few.volumes.sum() == pytest.approx(body.volumes.sum())
-    tensors = few.coupling.dense[0].reshape(k, k, 3, 3).transpose(0, 2, 1, 3).reshape(3 * k, 3 * k)
+    law = demagnetization.pair_law_tensors(few.coupling.positions, few.coupling.radii)
+    tensors = (few.coupling.grid_tensor + demagnetization.full_tensors(law.reshape(-1, 6))).reshape(k, k, 3, 3)
+    tensors = tensors.transpose(0, 2, 1, 3).reshape(3 * k, 3 * k)
     np.testing.assert_allclose(tensors, tensors.T, atol=1e-12 * np.abs(tensors).max())
     response = np.linalg.inv(np.diag(np.repeat(1.0 / (3.0 * few.volumes), 3)) - tensors)
     generator, half = np.random.default_rng(0), np.asarray(solid.upper)
@@ -124,8 +126,8 @@ def test_few_moments_respond_to_a_dipole_as_the_cells_do(solid, spacing):
 
 def test_forces_along_a_path_have_no_jump_and_equal_those_of_cells(device, monkeypatch):
     model = model_of(device, 0.2)
-    magnetics, cells, state = warpmag.Magnetics(model), with_cells(monkeypatch, model), model.state()
-    seen = []
+    magnetics, cells = warpmag.Magnetics(model, rtol=1e-4), with_cells(monkeypatch, model, rtol=1e-4)
+    state, seen = model.state(), []
     for gap in (0.2, 0.12, REACH + 0.004, REACH - 0.004, 0.02, REACH + 0.004, 0.12):
         put(state, [1], (0.002, 0.001, -0.004 - gap))
         actual, expected = wrenches(magnetics, state), wrenches(cells, state)
@@ -226,7 +228,7 @@ def test_fields_moments_and_values_of_few_moments_are_those_of_cells(device, mon
         assert rests(magnetics).all() and not rests(cells).any()
         actual, expected = magnetics.b_field(points), cells.b_field(points)
         # inside, the patterns are those of ideal permeability
-        assert relative(actual[0], expected[0]) < 5e-3 and relative(actual[1:], expected[1:]) < 0.05
+        assert relative(actual[0], expected[0]) < 5e-3 and relative(actual[1:], expected[1:]) < 0.08
         np.testing.assert_allclose(magnetics.shape_moments(), cells.shape_moments(), rtol=1e-2, atol=1e-4)
         np.testing.assert_allclose(magnetics.energy(), cells.energy(), rtol=1e-3)
 

@@ -136,7 +136,7 @@ def test_a_rollout():
         for now, after in itertools.pairwise(states):
             magnetics.apply(now)
             inputs = [dt, model.body_inv_mass, now.body_f, now.body_q, now.body_qd]
-            wp.launch(advance, 3, inputs=inputs, outputs=[after.body_q, after.body_qd])
+            wp.launch(advance, 3, inputs=inputs, outputs=[after.body_q, after.body_qd], device="cpu")
     seed = np.random.default_rng(7).normal(size=(3, 3))
     states[-1].body_q.grad.assign(np.pad(seed, ((0, 0), (0, 4))))
     tape.backward()

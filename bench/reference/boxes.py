@@ -84,7 +84,7 @@ def pair_correction(a, b, window, close) -> np.ndarray:
     return fade(distance, window) * tensor
 
 
-def body_corrections(cells, bodies, window, close, hardening: float) -> np.ndarray:
+def body_corrections(cells, bodies, window, close, hardening: float, steepness: float) -> np.ndarray:
     """Tensors between cells of different bodies [1/m³], shape [n, 3, n, 3]: H_i is the sum of T_ij m_j.
 
     Args:
@@ -92,6 +92,7 @@ def body_corrections(cells, bodies, window, close, hardening: float) -> np.ndarr
         bodies: Body of each cell, shape [n].
         window, close: As for :func:`pair_correction`.
         hardening: Demagnetizing factor added to a cell inside another body.
+        steepness: Inverse depth from which a cell gets all of it.
     """
     n, tensors, depth = len(cells), np.zeros((len(cells), 3, len(cells), 3)), np.zeros(len(cells))
     for i, j in itertools.combinations(range(n), 2):
@@ -100,6 +101,6 @@ def body_corrections(cells, bodies, window, close, hardening: float) -> np.ndarr
             inscribed = cells[i][2].min() + cells[j][2].min()
             depth[[i, j]] += max(1.0 - np.linalg.norm(cells[i][0] - cells[j][0]) / inscribed, 0.0)
     volumes = np.array([8.0 * half.prod() for _, _, half in cells])
-    hardness = hardening * np.minimum(depth, 1.0) / volumes
+    hardness = hardening * np.minimum(steepness * depth, 1.0) / volumes
     tensors[np.arange(n), :, np.arange(n)] -= hardness[:, None, None] * np.eye(3)
     return tensors

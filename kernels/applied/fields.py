@@ -25,7 +25,9 @@ from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
-AT_TARGETS, AT_POINTS, AT_CELLS, AT_BALLS, ON_CELLS, REACT, ADD_UP = range(7)  # passes; as in ``passes.h``
+AT_TARGETS, AT_POINTS, AT_CELLS, AT_NEIGHBORS, AT_BALLS, ON_CELLS, REACT, ADD_UP = range(
+    8
+)  # passes; as in ``passes.h``
 OF_TARGETS, OF_BALLS, OF_CELLS = range(3)  # kinds of rows; as in ``passes.h``
 _TARGETS_PER_THREAD, _BALLS_PER_THREAD, _CELLS_PER_THREAD = 500, 50, 50
 """Fewest pairs of a source and a target, of a source and a ball, and fewest cells, per thread of a CPU."""
@@ -42,6 +44,7 @@ def _kernel(dtype, only_pass: int, group: int, coils: bool, solids: bool, cells:
     constants = {"MU0": MU0, "INVERSE_4PI": INVERSE_4PI, "COILS": int(coils), "SOLIDS": int(solids)}
     constants |= {"PASS": only_pass, "GROUP": group, "RATES": int(rates), "CELLS": int(cells)}
     constants |= dict(zip(("CELL_REACH_LOW", "CELL_REACH_HIGH"), near_cells.CELL_REACH, strict=True))
+    constants |= dict(zip(("STEEP_REACH_LOW", "STEEP_REACH_HIGH"), near_cells.STEEP_REACH, strict=True))
     constants |= {kind.name: kind.value for kind in SourceKind}
     constants |= dict(zip(("BALLS", "MAGNET_REACH_LOW", "MAGNET_REACH_HIGH", "RESPONSE_ROWS"), balls, strict=True))
     return native_kernel(call, "applied/passes.h", arguments, dtype=dtype, **constants)
@@ -129,7 +132,11 @@ class AppliedField:
     def launch(self):
         """Launch the evaluation of the field at the targets, from the present positions of sources and targets."""
         self._launch_at_targets()
-        self.run_passes(AT_CELLS, AT_CELLS, self.cell_count, _GROUP, _CELLS_PER_THREAD)
+        ranges = (
+            [(AT_CELLS, AT_CELLS), (AT_NEIGHBORS, AT_NEIGHBORS)] if self.device.is_cuda else [(AT_CELLS, AT_NEIGHBORS)]
+        )
+        for first, last in ranges:
+            self.run_passes(first, last, self.cell_count, _GROUP, _CELLS_PER_THREAD)
 
     def launch_left_out(self):
         """Launch the evaluation at the targets that :meth:`launch` leaves out; not to be captured in a graph."""
@@ -313,6 +320,11 @@ class AppliedForces(AppliedField):
         if first == REACT:
             self.run_passes(REACT, REACT, rows, _GROUP, 1)
         self.run_passes(ADD_UP, ADD_UP, sources, _GROUP, 1)
+
+    def write_image_factors(self, moments, radii, material):
+        """Launch :func:`near_cells.launch_image_factors` if there are cells."""
+        if self.cell_count:
+            near_cells.launch_image_factors(self.arrays.cells, moments, radii, material)
 
     def add(self, effective, forces, torques, response=None):
         """Add the forces on moments and between bodies near each other, and sum the reactions.

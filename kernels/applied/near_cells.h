@@ -3,17 +3,32 @@
 // The field at a cell's center does not represent a cell near the edge of a magnet, where the field varies over less
 // than a cell. There the average of the field over the cell is taken, H̄ = −Σ n φ̄ A/V over its faces, with the
 // mean potential φ̄ of FACE_POINTS points of a face. A face in front of a magnet has charges that vary over less than a
-// cell, too. They respond to the potentials at the points with q = −R φ, and have the energy −½ μ0 φᵀ R φ. Python
-// computes R (``warpmag.shapes.face_charges``); it leaves out uniform and linear charges.
+// cell, too. They respond with q = −R φ to the potentials φ at the points, less that of the average field, and have the
+// energy −½ μ0 φᵀ R φ. Python computes R (``warpmag.shapes.face_charges``); it leaves out uniform charges.
 //
 // Both fade with the distance of a cell from the body, in longest sides of the cell. Forces are the derivatives of the
-// energy. Takes CELL_REACH_LOW and CELL_REACH_HIGH from Python. ``Arrays`` is the struct of sources.py.
+// energy. Takes CELL_REACH_LOW, CELL_REACH_HIGH, STEEP_REACH_LOW and STEEP_REACH_HIGH from Python. ``Arrays`` is the
+// struct of sources.py.
 #pragma once
 #include "applied/target_field.h"
 
 namespace warpmag {
 
-constexpr int FACE_POINTS = 16, CELL_POINTS = 6 * FACE_POINTS; // as in near_cells.py
+constexpr int FACE_POINTS = 16, OUTER_POINTS = 6 * FACE_POINTS; // as in near_cells.py
+constexpr int FINE_POINTS = 9 * FACE_POINTS, COARSE_POINTS = 16, CELL_POINTS = FINE_POINTS + COARSE_POINTS;
+enum Nearness {
+    FAR_CELL,
+    STEEP_CELL,
+    NEAR_CELL
+}; // fields: at the center, with differences, averaged; as in near_cells.py
+
+// A range of the tables of points.
+struct PointRange {
+    int first, last;
+    Real weight; // of a point in its face
+};
+CUDA_CALLABLE inline PointRange fine_points() { return {0, FINE_POINTS, Real(1.0 / FACE_POINTS)}; }
+CUDA_CALLABLE inline PointRange coarse_points() { return {FINE_POINTS, CELL_POINTS, 1}; }
 
 // A cell in the world. The axes are those of its grid; ``outer`` has a bit for each face on the surface of the body.
 struct Cell {
@@ -28,14 +43,31 @@ struct Cell {
         for (int a = 0; a < 3; ++a) x += (half[a] * numbers(units + a * CELL_POINTS + k)) * broadcast(axes[a]);
         return x;
     }
-    // Charge at a point of a face per magnetic moment along the outward normal.
-    CUDA_CALLABLE Real share_of(int face) const { return 1 / (2 * FACE_POINTS * half[face / 2]); }
+    CUDA_CALLABLE Vector local_points(const Real* units, int k) const {
+        return {half[0] * numbers(units + k), half[1] * numbers(units + CELL_POINTS + k),
+                half[2] * numbers(units + 2 * CELL_POINTS + k)};
+    }
+    // Charges at these points by moments along the axes: rows 3 to 5 of ``units`` for means, 6 to 8 for differences.
+    CUDA_CALLABLE Number charges(const Real* units, int row, int k, Real of_face, Real3 m) const {
+        const Real* const weight = units + row * CELL_POINTS + k;
+        return of_face
+               * (m.x / (2 * half[0]) * numbers(weight) + m.y / (2 * half[1]) * numbers(weight + CELL_POINTS)
+                  + m.z / (2 * half[2]) * numbers(weight + 2 * CELL_POINTS));
+    }
+    // Adds −Σ φ times the charges by unit moments along the axes to ``sums``.
+    CUDA_CALLABLE void add_mean_field(const Real* units, int row, int k, Real of_face, Number phi, Vector& sums) const {
+        const Real* const weight = units + row * CELL_POINTS + k;
+        sums.x -= of_face / (2 * half[0]) * numbers(weight) * phi;
+        sums.y -= of_face / (2 * half[1]) * numbers(weight + CELL_POINTS) * phi;
+        sums.z -= of_face / (2 * half[2]) * numbers(weight + 2 * CELL_POINTS) * phi;
+    }
+    CUDA_CALLABLE Real3 to_world(Real3 v) const { return v.x * axes[0] + v.y * axes[1] + v.z * axes[2]; }
     CUDA_CALLABLE bool is_outer(int face) const { return outer >> face & 1; }
 };
 template <class Arrays> CUDA_CALLABLE inline Cell cell_at(const Arrays& arrays, int c) {
     const auto& row = arrays.cells.cell.data[c];  // moment, body of its rotation, range of permanent bodies
     const auto& form = arrays.cells.form.data[c]; // bits of outer faces, index of its matrices
-    const Real* const box = arrays.cells.box.data + 4 * (size_t)c; // half sides, χ/(χ + 2)
+    const Real* const box = arrays.cells.box.data + 4 * (size_t)c; // half sides, (μ − 1)/(μ + 1)
     const Real* const q = (const Real*)arrays.cells.rotation.data + 4 * (size_t)row[1];
     const Real* const grid = arrays.cells.grid.data + 9 * (size_t)row[1]; // axes of the grid in the body's frame
     const Real pose[7] = {0, 0, 0, q[0], q[1], q[2], q[3]};
@@ -58,8 +90,16 @@ template <class Arrays> CUDA_CALLABLE inline Cell cell_at(const Arrays& arrays, 
     }
     return cell;
 }
-CUDA_CALLABLE inline SourceFade cell_fade(const Cell& cell, const PermanentBody& body) {
-    return fade_of(cell.center, cell.size, CELL_REACH_LOW, CELL_REACH_HIGH, body.frame, body.box_center, body.box_half);
+// Weights of the averages of a body's field, and of its differences at coarse points. Their sum fades later.
+struct CellFades {
+    SourceFade fine, coarse;
+};
+CUDA_CALLABLE inline CellFades cell_fades(const Cell& cell, const PermanentBody& body) {
+    auto fade = [&](Real low, Real high) {
+        return fade_of(cell.center, cell.size, low, high, body.frame, body.box_center, body.box_half);
+    };
+    const SourceFade fine = fade(CELL_REACH_LOW, CELL_REACH_HIGH), all = fade(STEEP_REACH_LOW, STEEP_REACH_HIGH);
+    return {fine, {all.weight - fine.weight, all.slope - fine.slope, all.offset}};
 }
 // Points in the frame of a permanent body, and the face of the body that they have passed: the charge of that face, if
 // they are inside, and their height above it. Points on the face count as outside.
@@ -92,6 +132,13 @@ CUDA_CALLABLE inline PotentialField outer_field(const PermanentBody& body, Vecto
     const PotentialField f = potential_field_of(body.solid, body.m, points.at);
     return {f.phi - points.charge * points.height, body.frame.to_world(f.h + points.charge * points.normal)};
 }
+template <class Vectors> CUDA_CALLABLE inline void put_real3(const Vectors& to, int i, Real3 v) {
+    Real* const at = (Real*)to.data + 3 * (size_t)i;
+    at[0] = v.x, at[1] = v.y, at[2] = v.z;
+}
+template <class Vectors> CUDA_CALLABLE inline void add_real3(const Vectors& to, int i, Real3 v) {
+    put_real3(to, i, real3((const Real*)to.data + 3 * (size_t)i) + v);
+}
 CUDA_CALLABLE inline Real3 first_lane(Vector v) { return {lane_of(v.x, 0), lane_of(v.y, 0), lane_of(v.z, 0)}; }
 // Closed form of a body's field at the center of a cell, in all lanes.
 CUDA_CALLABLE inline TargetField center_field(const Cell& cell, const PermanentBody& body) {
@@ -101,40 +148,85 @@ CUDA_CALLABLE inline TargetField center_field(const Cell& cell, const PermanentB
     return {group_sums(f.h), group_sums(f.x), group_sums(f.y), group_sums(f.z)};
 }
 
-// Replaces the fields of near bodies at the center of cell c by their averages, and writes the potentials at the points
-// of its faces.
+// Half the difference of a body's field between the halves of a cell along its axes, of the components along them.
+CUDA_CALLABLE inline Real3 coarse_differences(const Cell& cell, const Real* units, const PermanentBody& body) {
+    Vector sums = zero_target_field().h;
+    const PointRange range = coarse_points();
+    for (int k = range.first + WIDTH * share(); k < range.last; k += WIDTH * SHARES)
+        cell.add_mean_field(units, 6, k, range.weight, outer_field(body, cell.points(units, k)).phi, sums);
+    return total_of(sums);
+}
+// Replaces the fields of near bodies at the center of cell c by their averages, and writes the differences of the field
+// between its halves, and the potentials at the points of its faces, without those of the average field: the
+// magnetization responds to it.
 template <class Arrays> CUDA_CALLABLE inline void average_over_cell(const Arrays& arrays, int c) {
     const Cell cell = cell_at(arrays, c);
     const Real* const units = arrays.cells.point.data;
-    Real* const potential = arrays.cells.potential.data + CELL_POINTS * (size_t)c;
-    Real3 field = {0, 0, 0}, acting = field;
-    bool is_near = false;
+    Real* const potential = arrays.cells.potential.data + OUTER_POINTS * (size_t)c;
+    Real3 field = {0, 0, 0}, acting = field, acting_mean = field, steepness = field;
+    int nearness = FAR_CELL;
+    const PointRange range = fine_points();
     for (int b = cell.first; b < cell.last; ++b) {
         const PermanentBody body = body_at(arrays, b);
-        const SourceFade fade = cell_fade(cell, body);
-        if (fade.weight == 0) continue;
+        const CellFades fade = cell_fades(cell, body);
         const bool acts = body.label != cell.label;
-        Vector sums = zero_target_field().h; // along the axes of the grid
-        for (int k = WIDTH * share(); k < CELL_POINTS; k += WIDTH * SHARES) {
-            const int face = k / FACE_POINTS;
-            const Number phi = outer_field(body, cell.points(units, k)).phi;
-            (face < 2 ? sums.x : face < 4 ? sums.y : sums.z) += (face % 2 ? -1 : 1) * cell.share_of(face) * phi;
-            if (acts) put(potential + k, (is_near ? numbers(potential + k) : 0 * phi) + fade.weight * phi);
+        if (fade.coarse.weight > 0) {
+            steepness += fade.coarse.weight * coarse_differences(cell, units, body);
+            if (acts && nearness == FAR_CELL) nearness = STEEP_CELL;
         }
-        const Real3 mean = total_of(sums);
-        const Real3 average = mean.x * cell.axes[0] + mean.y * cell.axes[1] + mean.z * cell.axes[2];
-        const Real3 change = fade.weight * (average - first_lane(center_field(cell, body).h));
+        if (fade.fine.weight == 0) continue;
+        Vector means = zero_target_field().h, differences = means; // along the axes of the grid
+        for (int k = WIDTH * share(); k < range.last; k += WIDTH * SHARES) {
+            const Number phi = outer_field(body, cell.points(units, k)).phi;
+            cell.add_mean_field(units, 3, k, range.weight, phi, means);
+            cell.add_mean_field(units, 6, k, range.weight, phi, differences);
+            if (acts && k < OUTER_POINTS)
+                put(potential + k, (nearness == NEAR_CELL ? numbers(potential + k) : 0 * phi) + fade.fine.weight * phi);
+        }
+        const Real3 average = cell.to_world(total_of(means));
+        const Real3 change = fade.fine.weight * (average - first_lane(center_field(cell, body).h));
         field += change;
-        if (acts) acting += change, is_near = true;
+        steepness += fade.fine.weight * total_of(differences);
+        if (acts) acting += change, acting_mean += fade.fine.weight * average, nearness = NEAR_CELL;
+    }
+    if (nearness == NEAR_CELL) {
+        const Vector along =
+            broadcast({dot(acting_mean, cell.axes[0]), dot(acting_mean, cell.axes[1]), dot(acting_mean, cell.axes[2])});
+        for (int k = WIDTH * share(); k < OUTER_POINTS; k += WIDTH * SHARES)
+            put(potential + k, numbers(potential + k) + dot(along, cell.local_points(units, k)));
     }
     if (share() != 0) return;
-    arrays.cells.near.data[c] = is_near;
-    Real* const at_change = (Real*)arrays.cells.change.data + 3 * (size_t)c;
-    at_change[0] = acting.x, at_change[1] = acting.y, at_change[2] = acting.z;
-    Real* const at_field = (Real*)arrays.targets.field.data + 3 * (size_t)cell.moment;
-    Real* const at_acting = (Real*)arrays.targets.acting.data + 3 * (size_t)cell.moment;
-    at_field[0] += field.x, at_field[1] += field.y, at_field[2] += field.z;
-    at_acting[0] += acting.x, at_acting[1] += acting.y, at_acting[2] += acting.z;
+    arrays.cells.near.data[c] = nearness;
+    put_real3(arrays.cells.change, c, acting);
+    put_real3(arrays.cells.steepness, c, steepness);
+    add_real3(arrays.targets.field, cell.moment, field);
+    add_real3(arrays.targets.acting, cell.moment, acting);
+}
+
+// Neighbor of cell c on a side (−x, +x, −y, ...), relative to c, and its weights (``warpmag.shapes.linear_cells``).
+struct CellNeighbor {
+    int step;
+    Real own, other;
+};
+template <class Arrays> CUDA_CALLABLE inline CellNeighbor cell_neighbor(const Arrays& arrays, int c, int side) {
+    const Real* const weights = arrays.cells.weight.data + 12 * (size_t)c;
+    return {arrays.cells.neighbor.data[6 * (size_t)c + side], weights[side], weights[6 + side]};
+}
+// Adds the field by which differences between halves magnetize cell c: the derivative of their energy.
+template <class Arrays> CUDA_CALLABLE inline void add_differences(const Arrays& arrays, int c) {
+    const Cell cell = cell_at(arrays, c);
+    const Real* const steepness = (const Real*)arrays.cells.steepness.data + 3 * (size_t)c;
+    Real h[3];
+    for (int k = 0; k < 3; ++k) {
+        h[k] = 0;
+        for (int side = 2 * k; side < 2 * k + 2; ++side) {
+            const CellNeighbor at = cell_neighbor(arrays, c, side);
+            Real sum = at.own * steepness[k];
+            if (at.step != 0) sum += cell_neighbor(arrays, c + at.step, side ^ 1).other * steepness[3 * at.step + k];
+            h[k] += (side % 2 ? Real(-0.25) : Real(0.25)) * sum;
+        }
+    }
+    if (share() == 0) add_real3(arrays.targets.field, cell.moment, cell.to_world({h[0], h[1], h[2]}));
 }
 
 // Charges that respond to the potentials at points k and its successors of an outer face.
@@ -147,36 +239,76 @@ CUDA_CALLABLE inline Number response_charges(const Cell& cell, const Real* poten
     return cell.response * charge;
 }
 
+// Moment of these charges, along the axes of the grid.
+CUDA_CALLABLE inline Real3 response_moment(const Cell& cell, const Real* potential, const Real* units) {
+    Vector sums = zero_target_field().h;
+    for (int k = WIDTH * share(); k < OUTER_POINTS; k += WIDTH * SHARES)
+        if (cell.is_outer(k / FACE_POINTS)) sums += response_charges(cell, potential, k) * cell.local_points(units, k);
+    return total_of(sums);
+}
+
 CUDA_CALLABLE inline Real3 effective_at(const Real* effective, size_t pitch, int i) {
     return {effective[i], effective[pitch + i], effective[2 * pitch + i]};
 }
-// Adds force/μ0 and torque/μ0 about the center of cell c by a body, less those of its field at the center.
+// Half the differences of the moments of the halves of cell c, along the axes of the grid.
 template <class Arrays>
-CUDA_CALLABLE inline void add_cell_wrench(const Arrays& arrays, const Cell& cell, int c, const PermanentBody& body,
-                                          Real3& force, Real3& torque) {
-    const SourceFade fade = cell_fade(cell, body);
-    if (fade.weight == 0 || body.label == cell.label) return;
+CUDA_CALLABLE inline Real3 moment_differences(const Arrays& arrays, const Cell& cell, int c, Real3 m) {
     const size_t pitch = arrays.effective.strides[0] / sizeof(Real);
-    const Real3 m = effective_at(arrays.effective.data, pitch, cell.moment);
-    const Real* const potential = arrays.cells.potential.data + CELL_POINTS * (size_t)c;
-    const Number zero = Number(Real(0));
+    Real d[3];
+    for (int k = 0; k < 3; ++k) {
+        d[k] = 0;
+        for (int side = 2 * k; side < 2 * k + 2; ++side) {
+            const CellNeighbor at = cell_neighbor(arrays, c, side);
+            const Real3 other = effective_at(arrays.effective.data, pitch, cell.moment + at.step);
+            const Real change = at.other * dot(other, cell.axes[k]) - at.own * dot(m, cell.axes[k]);
+            d[k] += (side % 2 ? Real(0.25) : Real(-0.25)) * change;
+        }
+    }
+    return {d[0], d[1], d[2]};
+}
+// Wrench/μ0 of a body on the charges of a cell by its moment, differences and response, at fine or coarse points.
+CUDA_CALLABLE inline Wrench wrench_on_charges(const Cell& cell, const PermanentBody& body, const Real* units,
+                                              PointRange range, Real3 m, Real3 difference, const Real* potential) {
     Wrench wrench = zero_wrench();
-    for (int k = WIDTH * share(); k < CELL_POINTS; k += WIDTH * SHARES) {
-        const int face = k / FACE_POINTS;
-        const Vector x = cell.points(arrays.cells.point.data, k);
+    for (int k = range.first + WIDTH * share(); k < range.last; k += WIDTH * SHARES) {
+        const Vector x = cell.points(units, k);
         const PotentialField at_points = outer_field(body, x);
-        Number charge = zero + (face % 2 ? 1 : -1) * cell.share_of(face) * dot(m, cell.axes[face / 2]);
-        if (cell.is_outer(face)) charge += response_charges(cell, potential, k);
+        Number charge =
+            cell.charges(units, 3, k, range.weight, m) + cell.charges(units, 6, k, range.weight, difference);
+        if (potential != nullptr && k < OUTER_POINTS && cell.is_outer(k / FACE_POINTS))
+            charge += response_charges(cell, potential, k);
         const Vector f = charge * at_points.h;
         wrench.force += f;
         wrench.torque += cross(x - broadcast(cell.center), f);
         wrench.energy += charge * at_points.phi;
     }
+    return wrench;
+}
+// Adds force/μ0 and torque/μ0 about the center of cell c by a body, less those of its field at the center.
+template <class Arrays>
+CUDA_CALLABLE inline void add_cell_wrench(const Arrays& arrays, const Cell& cell, int c, const PermanentBody& body,
+                                          Real3& force, Real3& torque) {
+    const CellFades fade = cell_fades(cell, body);
+    if ((fade.fine.weight == 0 && fade.coarse.weight == 0) || body.label == cell.label) return;
+    const Real* const units = arrays.cells.point.data;
+    const Real3 m = effective_at(arrays.effective.data, arrays.effective.strides[0] / sizeof(Real), cell.moment);
+    const Real3 difference = moment_differences(arrays, cell, c, m);
+    auto add = [&](const SourceFade& by, Real3 f, Real3 t, Real energy) {
+        force += by.weight * f - energy * by.slope;
+        torque += by.weight * t;
+    };
+    if (fade.coarse.weight > 0) {
+        const Wrench w = wrench_on_charges(cell, body, units, coarse_points(), {0, 0, 0}, difference, nullptr);
+        add(fade.coarse, total_of(w.force), total_of(w.torque), total_of(w.energy));
+    }
+    if (fade.fine.weight == 0) return;
+    const Real3 along = {dot(m, cell.axes[0]), dot(m, cell.axes[1]), dot(m, cell.axes[2])};
+    const Real* const potential = arrays.cells.potential.data + OUTER_POINTS * (size_t)c;
+    const Real3 responding = along - response_moment(cell, potential, units); // potentials lack the average field
+    const Wrench w = wrench_on_charges(cell, body, units, fine_points(), responding, difference, potential);
     const TargetField at_center = center_field(cell, body);
     const Real3 h = first_lane(at_center.h), f = first_lane(gradient_dot(at_center, broadcast(m)));
-    const Real energy = total_of(wrench.energy) + dot(m, h);
-    force += fade.weight * (total_of(wrench.force) - f) - energy * fade.slope;
-    torque += fade.weight * (total_of(wrench.torque) - cross(m, h));
+    add(fade.fine, total_of(w.force) - f, total_of(w.torque) - cross(m, h), total_of(w.energy) + dot(m, h));
 }
 
 // Adds force and torque of near bodies on cell c. The torque m × H of its moment contains the averages already.
@@ -189,10 +321,8 @@ template <class Arrays> CUDA_CALLABLE inline void act_on_cell(const Arrays& arra
     Real3 force = {0, 0, 0}, torque = cross(change, m);
     for (int b = cell.first; b < cell.last; ++b) add_cell_wrench(arrays, cell, c, body_at(arrays, b), force, torque);
     if (share() != 0) return;
-    Real* const on = (Real*)arrays.cells.forces.data + 3 * (size_t)cell.moment;
-    Real* const about = (Real*)arrays.cells.torques.data + 3 * (size_t)cell.moment;
-    on[0] += MU0 * force.x, on[1] += MU0 * force.y, on[2] += MU0 * force.z;
-    about[0] += MU0 * torque.x, about[1] += MU0 * torque.y, about[2] += MU0 * torque.z;
+    add_real3(arrays.cells.forces, cell.moment, MU0 * force);
+    add_real3(arrays.cells.torques, cell.moment, MU0 * torque);
 }
 
 // Force/μ0 on cells ``first`` to ``last`` − 1 by a body, and their torque/μ0 about its reference point.

@@ -10,11 +10,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from warpmag.kernels.material.curves import curve_slope, inverse_curve_ratio
+from warpmag.kernels.shared.native import native_options
+
 FACE_SPLIT = 4  # squares along each side of a face
 FACE_POINTS = FACE_SPLIT**2  # points of a face; as in ``near_cells.h``
+COARSE_POINTS = 16  # points of a cell for differences at a distance, and padding; as in ``near_cells.h``
+NEAR = 2  # value of ``near`` of cells over which fields are averaged; as in ``near_cells.h``
 CELL_REACH = 0.75, 1.25
 """Distances from a body's box at which averages start to turn into the field at the center, and are it, in longest
 sides of a cell. At a distance of one side both differ by 2 to 3 %."""
+STEEP_REACH = 4.0, 6.0
+"""The same distances for the difference of the field between the halves of a cell."""
 
 
 class NearCellBody(NamedTuple):
@@ -23,7 +30,6 @@ class NearCellBody(NamedTuple):
     first: int  # first moment
     coupling: Any  # the ``warpmag.shapes.demagnetization.Coupling`` of its cells
     response: np.ndarray  # R of the faces of whole cells [m] (``near_cells.h``), shape [3, FACE_POINTS, FACE_POINTS]
-    susceptibility: float  # initial slope χ of its curve
 
 
 @cache
@@ -36,34 +42,46 @@ def cell_arrays_type(dtype):
         # Cells, shape [cells]:
         cell: wp.array[wp.vec4i]  # moment, index of its body in ``rotation``, range of permanent bodies
         form: wp.array[wp.vec2i]  # bits of the faces on the body's surface (−x, +x, −y, ...), index of its matrices
-        box: wp.array2d[dtype]  # half sides [m], and χ/(χ + 2), shape [cells, 4]
+        box: wp.array2d[dtype]  # half sides [m], and (μ − 1)/(μ + 1) at the last forces, shape [cells, 4]
+        neighbor: wp.array2d[int]  # index of the neighbor on each side, less that of the cell, shape [cells, 6]
+        weight: wp.array2d[dtype]  # weights of a cell and of its neighbors in its differences, shape [cells, 12]
         # Bodies, shape [bodies]:
         rotation: wp.array[quaternion]  # from each body's frame to the world
         grid: wp.array2d[dtype]  # axes of the grid in the body's frame, shape [bodies, 9]
         # Tables:
         response: wp.array[dtype]  # R [m] of faces across x, y and z, shape [kinds, 3, FACE_POINTS, FACE_POINTS]
-        point: wp.array[dtype]  # points on the faces of a cube of half side 1, shape [3, 6 FACE_POINTS]
+        point: wp.array[dtype]  # points of a cell and charges at them (:func:`unit_points`), shape [9, points]
         # Moments, shape [n]:
         movable: wp.array[int]
         forces: wp.array[vec3]  # [N], added to
         torques: wp.array[vec3]  # about the moments' positions [N·m], added to
         # Data out:
         change: wp.array[vec3]  # change of the field that exerts torques by the averages [A/m], shape [cells]
-        near: wp.array[int]  # 1 for cells near a body that acts on them, shape [cells]
+        steepness: wp.array[vec3]  # half the field's difference between a cell's halves, along the grid [A/m], [cells]
+        near: wp.array[int]  # how near a body is that acts on a cell: 0, 1 for differences, NEAR, shape [cells]
         potential: wp.array[dtype]  # potential of these bodies at the points, faded [A], shape [cells, 6 FACE_POINTS]
 
     return CellArrays
 
 
 def unit_points() -> np.ndarray:
-    """Return the points on the faces −x, +x, −y, ... of a cube of half side 1, shape [3, 6, FACE_POINTS]."""
+    """Return the points of a cell and the charges at them, shape [9, 9 FACE_POINTS + COARSE_POINTS].
+
+    Rows are the positions in a cube of half side 1, the charges by moments along the axes, and those by differences
+    of the halves along the axes. The fine points are those of the faces −x, +x, −y, ... and of the planes x, y, z = 0;
+    their charges have weights 1/FACE_POINTS. The coarse points are the centers of the faces, and of the cell.
+    """
     middles = (2.0 * np.arange(FACE_SPLIT) + 1.0) / FACE_SPLIT - 1.0
     u, v = (values.ravel() for values in np.meshgrid(middles, middles, indexing="ij"))
-    points = np.empty((3, 6, FACE_POINTS))
-    for face in range(6):
-        axis, (first, second) = face // 2, [k for k in range(3) if k != face // 2]
-        points[axis, face], points[first, face], points[second, face] = 2.0 * (face % 2) - 1.0, u, v
-    return points
+    fine, coarse = np.zeros((9, 9, FACE_POINTS)), np.zeros((9, COARSE_POINTS))
+    for plane in range(9):
+        axis, height = (plane // 2, 2.0 * (plane % 2) - 1.0) if plane < 6 else (plane - 6, 0.0)
+        first, second = (k for k in range(3) if k != axis)
+        fine[axis, plane], fine[first, plane], fine[second, plane] = height, u, v
+        fine[3 + axis, plane], fine[6 + axis, plane] = height, 1.0 if height else -2.0
+        coarse[axis, min(plane, 6)] = height
+        coarse[6 + axis, min(plane, 6)] = 1.0 if height else -2.0
+    return np.concatenate([fine.reshape(9, -1), coarse], axis=1)
 
 
 def _axes(rotation: np.ndarray) -> np.ndarray:
@@ -91,7 +109,8 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solid_rang
         values = np.ascontiguousarray(values, float if kind == dtype else np.int32)
         return wp.array(values, dtype=kind, device=device)
 
-    cells, forms, boxes, grids, tables = [], [], [], np.zeros((len(bodies), 9)), {}
+    cells, forms, boxes, neighbors, weights = [], [], [], [], []
+    grids, tables = np.zeros((len(bodies), 9)), {}
     for number, body in enumerate(bodies):
         if body is None:
             continue
@@ -101,24 +120,68 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solid_rang
         cells.append(np.column_stack([moments, np.full(count, number), solid_ranges[moments]]))
         bits = coupling.outer_faces @ (1 << np.arange(6))
         forms.append(np.column_stack([bits, np.full(count, table[0])]))
-        factor = body.susceptibility / (body.susceptibility + 2.0) if np.isfinite(body.susceptibility) else 1.0
-        boxes.append(np.column_stack([coupling.half_sides, np.full(count, factor)]))
+        boxes.append(np.column_stack([coupling.half_sides, np.zeros(count)]))
+        neighbors.append(coupling.neighbor - np.arange(count)[:, None])
+        weights.append(coupling.weights)
         grids[number] = _axes(coupling.grid_rotation)
     order = np.argsort(np.concatenate([rows[:, 0] for rows in cells]), kind="stable")
     arrays.cell = put(np.concatenate(cells)[order], wp.vec4i)
     arrays.form = put(np.concatenate(forms)[order], wp.vec2i)
     arrays.box, arrays.grid = put(np.concatenate(boxes)[order], dtype), put(grids, dtype)
+    arrays.neighbor = put(np.concatenate(neighbors)[order])
+    arrays.weight = put(np.concatenate(weights)[order], dtype)
     arrays.rotation, arrays.point = rotations, put(unit_points().ravel(), dtype)
     arrays.response = put(np.concatenate([matrices.ravel() for _, matrices in tables.values()]), dtype)
     arrays.movable = put(movable)
     arrays.near = wp.zeros(len(order), dtype=wp.int32, device=device)
-    arrays.change = wp.zeros(len(order), dtype=wp.types.vector(3, dtype), device=device)
+    arrays.change, arrays.steepness = (
+        wp.zeros(len(order), dtype=wp.types.vector(3, dtype), device=device) for _ in range(2)
+    )
     arrays.potential = wp.zeros(len(order) * 6 * FACE_POINTS, dtype=dtype, device=device)
+
+
+@cache
+def _image_factor_kernel(dtype):
+    cells_struct, vec3 = cell_arrays_type(dtype), wp.types.vector(3, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=native_options("material/curves.h", dtype=dtype))
+    def write_image_factors(
+        moments: wp.array[vec3],
+        radii: wp.array[dtype],
+        saturation: wp.array[dtype],
+        slope: wp.array[dtype],
+        curve: wp.array[int],
+        tables: wp.array2d[dtype],
+        cells: cells_struct,
+    ):
+        c = wp.tid()
+        i = cells.cell[c][0]
+        k, volume = slope[i], dtype(4.18879020478639) * radii[i] * radii[i] * radii[i]
+        reduced = wp.length(moments[i]) / (volume * saturation[i])
+        s = inverse_curve_ratio(reduced, k, curve[i], tables) * reduced
+        steep = k * curve_slope(s, k, curve[i], tables)
+        cells.box[c, 3] = steep / (dtype(2.0) + steep / dtype(3.0))
+
+    return write_image_factors
+
+
+def launch_image_factors(arrays, moments, radii, material):
+    """Write the factor (μ − 1)/(μ + 1) of the charges on the faces of cells, for their differential permeability μ.
+
+    Args:
+        arrays: The struct of :func:`cell_arrays_type`.
+        moments: Moments [A·m²], shape [n].
+        radii: Radii of their balls [m], shape [n].
+        material: Their curves (``material.curves.CurveParameters``).
+    """
+    values = moments, radii, material.saturation, material.slope, material.curve, material.tables
+    kernel = _image_factor_kernel(arrays.box.dtype)
+    wp.launch(kernel, arrays.cell.shape[0], inputs=[*values, arrays], device=moments.device)
 
 
 def energies(arrays) -> np.ndarray:
     """Return the energies over μ0 of the charges on the faces of cells, −½ φᵀ R φ, shape [cells]."""
-    near = np.flatnonzero(arrays.near.numpy())
+    near = np.flatnonzero(arrays.near.numpy() == NEAR)
     forms, factors = arrays.form.numpy()[near], arrays.box.numpy()[near, 3].astype(float)
     potentials = arrays.potential.numpy().reshape(-1, 6, FACE_POINTS)[near].astype(float)
     matrices = arrays.response.numpy().reshape(-1, 3, FACE_POINTS, FACE_POINTS)[forms[:, 1]].astype(float)

@@ -15,9 +15,9 @@
 
 namespace warpmag {
 
-enum SourcePass { AT_TARGETS, AT_POINTS, AT_CELLS, AT_BALLS, ON_CELLS, REACT, ADD_UP }; // as in fields.py
-enum RowKind { OF_TARGETS, OF_BALLS, OF_CELLS };                                        // as in fields.py
-constexpr int WRENCH_ROW = 7;                                                           // force, torque, energy
+enum SourcePass { AT_TARGETS, AT_POINTS, AT_CELLS, AT_NEIGHBORS, AT_BALLS, ON_CELLS, REACT, ADD_UP }; // as in fields.py
+enum RowKind { OF_TARGETS, OF_BALLS, OF_CELLS };                                                      // as in fields.py
+constexpr int WRENCH_ROW = 7; // force, torque, energy
 
 // Targets from column i on: positions, radii, labels, and bits of their kind.
 constexpr int CORRECTED = 1, MAGNETIZED = 2; // bits of a target, as in sources.py
@@ -241,6 +241,8 @@ CUDA_CALLABLE inline void apply_sources(int thread, int first, int last, int thr
             if (pass == AT_POINTS) field_at_targets<true>(arrays, i);
         if constexpr (CELLS && (PASS < 0 || PASS == AT_CELLS))
             if (pass == AT_CELLS && has_bodies(arrays, i)) average_over_cell(arrays, i);
+        if constexpr (CELLS && (PASS < 0 || PASS == AT_NEIGHBORS))
+            if (pass == AT_NEIGHBORS && has_bodies(arrays, i)) add_differences(arrays, i);
         if constexpr (BALLS && (PASS < 0 || PASS == AT_BALLS))
             if (pass == AT_BALLS) expand(arrays, i);
         if constexpr (CELLS && (PASS < 0 || PASS == ON_CELLS))
@@ -257,6 +259,7 @@ CUDA_CALLABLE inline void apply_sources(int thread, int first, int last, int thr
         switch (pass) {
         case AT_BALLS: return arrays.balls.ball.shape[0];
         case AT_CELLS:
+        case AT_NEIGHBORS:
         case ON_CELLS: return arrays.cells.cell.shape[0];
         case REACT: return arrays.row.shape[0];
         case ADD_UP: return arrays.wrench.shape[0];

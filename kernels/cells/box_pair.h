@@ -1,9 +1,10 @@
 // Tensor and forces of a pair of magnetized boxes, less those of balls of the same volumes, in the frame of box i.
 //
-// The tensor of close boxes is the field of the larger box, averaged over 2³ Gauss points of the smaller one. Those
-// farther away differ from balls by their quadrupoles. A window ends this difference. Forces are the exact derivatives
-// of the energy −μ0 m_i·T_ij·m_j, so that they conserve energy and momentum. Lengths are in units of the mean of the
-// boxes' sizes.
+// The tensor of close boxes is the field of the larger box, averaged over 2³ Gauss points of the smaller one. One of a
+// pair may be a ball: a ball's field is a closed form, too, and the average over a ball is the value at its center.
+// Those farther away differ from balls by their quadrupoles. A window ends this difference. Forces are the exact
+// derivatives of the energy −μ0 m_i·T_ij·m_j, so that they conserve energy and momentum. Lengths are in units of the
+// mean of the boxes' sizes.
 //
 // From Python: WINDOW_BEGIN, WINDOW_END, CLOSE_BEGIN and CLOSE_END, distances of the windows.
 #pragma once
@@ -15,10 +16,12 @@ namespace warpmag {
 
 constexpr Real SMALLER = Real(0.999); // ratio of volumes from which a box counts as smaller than another one
 
-// Boxes of cells: half sides, rotation to the world as quaternion, volume, and the size that scales the window.
+// Boxes of cells: half sides, rotation to the world as quaternion, volume, the size that scales the window, and the
+// radius of the ball of the same volume. Balls have half sides for the windows only.
 struct Boxes {
     Vector half;
-    Number q[4], volume, size, radius; // radius of the ball of the same volume
+    Number q[4], volume, size, radius;
+    Mask ball;
 };
 
 // Pose of box j relative to box i: separation, and rotation from the frame of j to that of i.
@@ -45,12 +48,13 @@ CUDA_CALLABLE inline Window window_between(Number d, Real begin, Real end, Mask 
 
 // A pair of boxes in units of ``1/unit``: half sides, separation r from i to j, rotation of j in the frame of i, radii
 // of the balls, the window of all boxes, and that of close boxes. ``own_points``: the Gauss points are those of i.
+// ``of_ball``: the other one of the pair, the source, is a ball; ``at_ball``: the one with the points is.
 struct BoxPair {
     Vector half, other_half, r;
     Rotation<Number> rotation;
     Number unit, radius, other_radius;
     Window window, close;
-    Mask own_points;
+    Mask own_points, of_ball, at_ball;
 };
 CUDA_CALLABLE inline Number longest(Vector half) { return larger(half.x, larger(half.y, half.z)); }
 CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, const RelativePose& pose, Mask listed,
@@ -61,6 +65,7 @@ CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, cons
     Window close = window_between(d / side, CLOSE_BEGIN, CLOSE_END, listed);
     close.slope /= side;
     const Mask own_smaller = own.volume < SMALLER * other.volume, alike = own.volume * SMALLER <= other.volume;
+    const Mask own_points = own_smaller | (own_first & alike);
     return {unit * own.half,
             unit * other.half,
             r,
@@ -70,14 +75,30 @@ CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, cons
             unit * other.radius,
             window_between(d, WINDOW_BEGIN, WINDOW_END, listed),
             close,
-            own_smaller | (own_first & alike)};
+            own_points,
+            own_points ? other.ball : own.ball,
+            own_points ? own.ball : other.ball};
 }
 
-// Calls visit(p) for 2³ Gauss points of a box of half sides h, which have equal weights.
+// Calls visit(p, signs) for 2³ Gauss points of a box of half sides h, which have equal weights. The signs tell the half
+// along each axis.
 template <class Visit> CUDA_CALLABLE inline void for_gauss_points(Vector h, Visit visit) {
     constexpr Real PLACE = Real(0.5773502691896258);
-    for (int k = 0; k < 8; ++k)
-        visit(Vector{(k & 1 ? PLACE : -PLACE) * h.x, (k & 2 ? PLACE : -PLACE) * h.y, (k & 4 ? PLACE : -PLACE) * h.z});
+    for (int k = 0; k < 8; ++k) {
+        const Real signs[3] = {Real(k & 1 ? 1 : -1), Real(k & 2 ? 1 : -1), Real(k & 4 ? 1 : -1)};
+        visit(Vector{PLACE * signs[0] * h.x, PLACE * signs[1] * h.y, PLACE * signs[2] * h.z}, signs);
+    }
+}
+
+// Upper half of a box along an axis, seen from a point of the frame of the box.
+CUDA_CALLABLE inline BoxView view_upper_half(Vector r, Vector half, int axis) {
+    const Real x = axis == 0 ? Real(0.5) : Real(0), y = axis == 1 ? Real(0.5) : Real(0),
+               z = axis == 2 ? Real(0.5) : Real(0);
+    return view_box({r.x - x * half.x, r.y - y * half.y, r.z - z * half.z},
+                    {(1 - x) * half.x, (1 - y) * half.y, (1 - z) * half.z});
+}
+CUDA_CALLABLE inline Vector column(const Symmetric& t, int k) {
+    return k == 0 ? Vector{t.xx, t.xy, t.zx} : k == 1 ? Vector{t.xy, t.yy, t.yz} : Vector{t.zx, t.yz, t.zz};
 }
 
 CUDA_CALLABLE inline Symmetric operator+(const Symmetric& a, const Symmetric& b) {
@@ -114,20 +135,54 @@ CUDA_CALLABLE inline BallLaw ball_law(const BoxPair& p) {
     return {at.u, d, g};
 }
 
+// Field tensor of a uniformly magnetized ball at r from its center, times its volume: a dipole outside, uniform inside.
+CUDA_CALLABLE inline Symmetric ball_tensor(Vector r, Number radius) {
+    const Number zero = radius * Real(0), d = length(r), inverse = 1 / larger(d, radius), i2 = inverse * inverse;
+    const Number g1 = -INVERSE_4_PI * i2 * inverse, g2 = d < radius ? zero : -3 * i2 * g1;
+    return {g1 + g2 * r.x * r.x, g1 + g2 * r.y * r.y, g1 + g2 * r.z * r.z,
+            g2 * r.x * r.y,      g2 * r.y * r.z,      g2 * r.z * r.x};
+}
+// Symmetric product of two vectors in the derivatives of this tensor, as ``box_slope``.
+CUDA_CALLABLE inline Vector ball_slope(Vector r, Number radius, Vector m, Vector e) {
+    const Number zero = radius * Real(0), d = length(r), inverse = 1 / larger(d, radius), i2 = inverse * inverse;
+    const Number factor = d < radius ? zero : 3 * INVERSE_4_PI * i2 * i2 * inverse, rm = dot(r, m), re = dot(r, e);
+    return factor * ((dot(m, e) - 5 * i2 * rm * re) * r + re * m + rm * e);
+}
+
 // A source, the box whose field is evaluated, and a target, the box with the Gauss points, in the frame of the source.
 struct SourceAndTarget {
-    Vector half, target_half, center; // half sides, and the target's center
+    Vector half, target_half, center; // half sides, 0 for the target if it is a ball, and the target's center
+    Number radius;                    // of the source
+    Mask is_ball;                     // the source
     Rotation<Number> rotation;        // from the frame of the target to that of the source
     Number scale;                     // weight of a point, over the source's volume
 
     CUDA_CALLABLE explicit SourceAndTarget(const BoxPair& p) {
         const Mask own = p.own_points;
         half = choose(own, p.other_half, p.half);
-        target_half = choose(own, p.half, p.other_half);
+        const Number zero = p.unit * Real(0);
+        target_half = choose(p.at_ball, {zero, zero, zero}, choose(own, p.half, p.other_half));
+        radius = own ? p.other_radius : p.radius;
+        is_ball = p.of_ball;
         center = choose(own, -to_body(p.rotation, p.r), p.r);
         for (int k = 0; k < 3; ++k)
             for (int l = 0; l < 3; ++l) rotation.rows[k][l] = own ? p.rotation.rows[l][k] : p.rotation.rows[k][l];
-        scale = Real(1.0 / 64) / (half.x * half.y * half.z);
+        const Number volume = 8 * half.x * half.y * half.z;
+        scale = Real(1.0 / 8) / (is_ball ? zero + 1 : volume);
+    }
+    // Field tensor of the source, times its volume if it is a box, and of the upper half of a box along an axis.
+    CUDA_CALLABLE Symmetric tensor(Vector at) const {
+        const Symmetric box = box_tensor(view_box(at, half));
+        return any(is_ball) ? choose(is_ball, ball_tensor(at, radius), box) : box;
+    }
+    CUDA_CALLABLE Symmetric upper_half_tensor(Vector at, int axis) const {
+        const Symmetric box = box_tensor(view_upper_half(at, half, axis));
+        return any(is_ball) ? choose(is_ball, Real(0.5) * ball_tensor(at, radius), box) : box;
+    }
+    // Force of the source on a moment ``here``.
+    CUDA_CALLABLE Vector push(Vector at, Vector moment, Vector here) const {
+        const Vector box = box_slope(view_box(at, half), moment, here);
+        return any(is_ball) ? choose(is_ball, ball_slope(at, radius, moment, here), box) : box;
     }
     // A vector of the frame of i in that of the source, and back.
     static CUDA_CALLABLE Vector to_source(const BoxPair& p, Vector a) {
@@ -139,19 +194,51 @@ struct SourceAndTarget {
     static CUDA_CALLABLE Vector choose(Mask first, Vector a, Vector b) {
         return {first ? a.x : b.x, first ? a.y : b.y, first ? a.z : b.z};
     }
+    static CUDA_CALLABLE Symmetric choose(Mask first, const Symmetric& a, const Symmetric& b) {
+        return {first ? a.xx : b.xx, first ? a.yy : b.yy, first ? a.zz : b.zz,
+                first ? a.xy : b.xy, first ? a.yz : b.yz, first ? a.zx : b.zx};
+    }
 };
 
-// Field tensor of the source, averaged over the Gauss points of the target, in the frame of i.
-CUDA_CALLABLE inline Symmetric boxes_tensor(const BoxPair& p) {
+// Matrices of a pair of boxes, rows in the frame of i and columns in that of j: fields of means and of differences, by
+// mean moments and half differences of the halves.
+struct PairMatrices {
+    Number means[9], of_differences[9], at_differences[9], differences[9];
+};
+// The fields of the source, averaged over the Gauss points of the target.
+CUDA_CALLABLE inline PairMatrices boxes_matrices(const BoxPair& p) {
     const SourceAndTarget s(p);
     const Number zero = p.unit * Real(0);
-    Symmetric sum = {zero, zero, zero, zero, zero, zero};
-    for_gauss_points(s.target_half,
-                     [&](Vector x) { sum = sum + box_tensor(view_box(s.center + to_world(s.rotation, x), s.half)); });
-    const Symmetric t = s.scale * sum, turned = rotated(p.rotation, t);
+    PairMatrices sums; // rows in the frame of the target, columns in that of the source
+    for (int k = 0; k < 9; ++k)
+        sums.means[k] = sums.of_differences[k] = sums.at_differences[k] = sums.differences[k] = zero;
+    for_gauss_points(s.target_half, [&](Vector x, const Real* signs) {
+        const Vector at = s.center + to_world(s.rotation, x);
+        const Symmetric full = s.tensor(at);
+        for (int l = 0; l < 3; ++l) {
+            const Vector of_upper = column(s.upper_half_tensor(at, l), l), of_both = column(full, l);
+            const Vector mean = to_body(s.rotation, of_both), difference = to_body(s.rotation, 2 * of_upper - of_both);
+            const Number by_mean[3] = {mean.x, mean.y, mean.z},
+                         by_difference[3] = {difference.x, difference.y, difference.z};
+            for (int k = 0; k < 3; ++k) {
+                sums.means[3 * k + l] += by_mean[k];
+                sums.of_differences[3 * k + l] += by_difference[k];
+                sums.at_differences[3 * k + l] += signs[k] * by_mean[k];
+                sums.differences[3 * k + l] += signs[k] * by_difference[k];
+            }
+        }
+    });
+    PairMatrices result; // of the pair: transposed where i is the source
     const Mask own = p.own_points;
-    return {own ? turned.xx : t.xx, own ? turned.yy : t.yy, own ? turned.zz : t.zz,
-            own ? turned.xy : t.xy, own ? turned.yz : t.yz, own ? turned.zx : t.zx};
+    for (int k = 0; k < 3; ++k)
+        for (int l = 0; l < 3; ++l) {
+            const int here = 3 * k + l, across = 3 * l + k;
+            result.means[here] = s.scale * (own ? sums.means[here] : sums.means[across]);
+            result.of_differences[here] = s.scale * (own ? sums.of_differences[here] : sums.at_differences[across]);
+            result.at_differences[here] = s.scale * (own ? sums.at_differences[here] : sums.of_differences[across]);
+            result.differences[here] = s.scale * (own ? sums.differences[here] : sums.differences[across]);
+        }
+    return result;
 }
 
 // Quadrupoles of a pair: the traceless mean of x xᵀ over box i, along its axes, the sum Q of both in the frame of i,
@@ -197,24 +284,46 @@ CUDA_CALLABLE inline Symmetric quadrupole_tensor(const BoxPair& p) {
             entry(q.sum.zx, r.z, v.z, r.x, v.x)};
 }
 
-// Tensor of the pair less that of the balls, in the frame of i and the units of the pair.
-CUDA_CALLABLE inline Symmetric pair_tensor(const BoxPair& p) {
+// Matrix of means less that of the balls for pairs that are not close, and its share for those that are.
+CUDA_CALLABLE inline void far_matrix(const BoxPair& p, Number* matrix) {
     const Number zero = p.unit * Real(0), close = p.close.value;
-    const Symmetric far = (1 - close) * quadrupole_tensor(p);
-    if (!any(close > zero)) return far;
-    const BallLaw ball = ball_law(p);
-    const Vector u = ball.u;
-    const Number factor = INVERSE_4_PI * close, g1 = factor * ball.g.g1, g2 = factor * ball.g.g2 * ball.d;
-    const Symmetric balls = {g1 + g2 * u.x * u.x, g1 + g2 * u.y * u.y, g1 + g2 * u.z * u.z,
-                             g2 * u.x * u.y,      g2 * u.y * u.z,      g2 * u.z * u.x};
-    return far + close * boxes_tensor(p) + (zero - 1) * balls;
+    Symmetric far = (1 - close) * quadrupole_tensor(p);
+    if (any(close > zero)) {
+        const BallLaw ball = ball_law(p);
+        const Vector u = ball.u;
+        const Number factor = INVERSE_4_PI * close, g1 = factor * ball.g.g1, g2 = factor * ball.g.g2 * ball.d;
+        far = far + (zero - 1) * Symmetric{g1 + g2 * u.x * u.x, g1 + g2 * u.y * u.y, g1 + g2 * u.z * u.z,
+                                           g2 * u.x * u.y,      g2 * u.y * u.z,      g2 * u.z * u.x};
+    }
+    for (int l = 0; l < 3; ++l) {
+        const auto& rows = p.rotation.rows;
+        const Vector f = far * Vector{rows[0][l], rows[1][l], rows[2][l]};
+        matrix[l] = f.x, matrix[3 + l] = f.y, matrix[6 + l] = f.z;
+    }
+}
+
+// Matrices of the pair less the law of the balls, in the units of the pair.
+CUDA_CALLABLE inline PairMatrices pair_matrices(const BoxPair& p) {
+    const Number zero = p.unit * Real(0), close = p.close.value;
+    PairMatrices result;
+    far_matrix(p, result.means);
+    for (int k = 0; k < 9; ++k) result.of_differences[k] = result.at_differences[k] = result.differences[k] = zero;
+    if (!any(close > zero)) return result;
+    const PairMatrices boxes = boxes_matrices(p);
+    for (int k = 0; k < 9; ++k) {
+        result.means[k] += close * boxes.means[k];
+        result.of_differences[k] = close * boxes.of_differences[k];
+        result.at_differences[k] = close * boxes.at_differences[k];
+        result.differences[k] = close * boxes.differences[k];
+    }
+    return result;
 }
 
 // Share of a cell's depth that it lies inside a box of another body: 0 for disjoint boxes, at most 1. Disjoint boxes
 // have disjoint inscribed spheres.
 CUDA_CALLABLE inline Number overlap_depth(const Boxes& own, const Boxes& other, Vector apart) {
-    auto inscribed = [](Vector h) { return smaller(h.x, smaller(h.y, h.z)); };
-    const Number zero = own.size * Real(0), reach = inscribed(own.half) + inscribed(other.half);
+    auto inscribed = [](const Boxes& b) { return b.ball ? b.radius : smaller(b.half.x, smaller(b.half.y, b.half.z)); };
+    const Number zero = own.size * Real(0), reach = inscribed(own) + inscribed(other);
     return larger(1 - length(apart) / reach, zero);
 }
 
@@ -230,24 +339,44 @@ struct Wrench {
     }
 };
 
-// Wrench of m·T e, for T of ``boxes_tensor`` and moments m of i and e of j, in the frame of i.
-CUDA_CALLABLE inline Wrench boxes_wrench(const BoxPair& p, Vector m, Vector e) {
+// Moments of a pair: means m of i and e of j in the frame of i, and half differences in the frames of their boxes.
+struct PairMoments {
+    Vector m, e, own_difference, other_difference;
+};
+
+// Wrench of close boxes. The source is a box of its mean less its differences, and the upper halves of twice each
+// difference. Balls have no differences.
+CUDA_CALLABLE inline Wrench boxes_wrench(const BoxPair& p, const PairMoments& moments) {
     const SourceAndTarget s(p);
     const Number zero = p.unit * Real(0);
-    const Vector m_s = s.to_source(p, m), e_s = s.to_source(p, e);
-    const Vector of_target = s.choose(p.own_points, m_s, e_s), of_source = s.choose(p.own_points, e_s, m_s);
+    const Mask own = p.own_points;
+    const Vector m_s = s.to_source(p, moments.m), e_s = s.to_source(p, moments.e);
+    const Vector of_target = s.choose(own, m_s, e_s), of_source = s.choose(own, e_s, m_s);
+    const Vector at_target = s.choose(own, moments.own_difference, moments.other_difference);
+    const Vector at_source = s.choose(own, moments.other_difference, moments.own_difference);
     Vector force = {zero, zero, zero}, torque = force; // on the target, about the center of the source
     Number work = zero;
-    for_gauss_points(s.target_half, [&](Vector x) {
+    for_gauss_points(s.target_half, [&](Vector x, const Real* signs) {
         const Vector at = s.center + to_world(s.rotation, x);
-        const BoxView view = view_box(at, s.half);
-        const Vector push = box_slope(view, of_source, of_target), field = box_tensor(view) * of_source;
-        force += push;
-        torque += cross(at, push) + cross(of_target, field);
-        work += dot(of_target, field);
+        const Vector difference = {signs[0] * at_target.x, signs[1] * at_target.y, signs[2] * at_target.z};
+        const Vector here = of_target + to_world(s.rotation, difference);
+        auto add = [&](Vector push, Vector field) {
+            force += push;
+            torque += cross(at, push) + cross(here, field);
+            work += dot(here, field);
+        };
+        auto add_half = [&](int axis, Vector source) {
+            const BoxView view = view_upper_half(at, s.half, axis);
+            add(box_slope(view, source, here), box_tensor(view) * source);
+        };
+        const Vector mean = of_source - at_source;
+        add(s.push(at, mean, here), s.tensor(at) * mean);
+        add_half(0, {2 * at_source.x, zero, zero});
+        add_half(1, {zero, 2 * at_source.y, zero});
+        add_half(2, {zero, zero, 2 * at_source.z});
     });
     const Vector about_target = torque - cross(s.center, force);
-    const Vector on_i = s.choose(p.own_points, force, -force), turning = s.choose(p.own_points, about_target, -torque);
+    const Vector on_i = s.choose(own, force, -force), turning = s.choose(own, about_target, -torque);
     return {s.scale * s.from_source(p, on_i), s.scale * s.from_source(p, turning), s.scale * work};
 }
 
@@ -279,8 +408,9 @@ CUDA_CALLABLE inline Wrench ball_wrench(const BoxPair& p, Vector m, Vector e) {
     return {g2 * (um * e + ue * m) + radial * u, cross(m, field), dot(m, field)};
 }
 
-// Wrench of m·T e, for T of ``pair_tensor`` and its windows.
-CUDA_CALLABLE inline Wrench pair_wrench(const BoxPair& p, Vector m, Vector e) {
+// Wrench of the pair less that of the balls, with its windows.
+CUDA_CALLABLE inline Wrench pair_wrench(const BoxPair& p, const PairMoments& moments) {
+    const Vector m = moments.m, e = moments.e;
     const Number zero = p.unit * Real(0), close = p.close.value;
     const Vector none = {zero, zero, zero}, inward = -1 / larger(length(p.r), zero + Real(1e-12)) * p.r;
     const Wrench far = quadrupole_wrench(p, m, e);
@@ -288,7 +418,7 @@ CUDA_CALLABLE inline Wrench pair_wrench(const BoxPair& p, Vector m, Vector e) {
     sum.add(1 - close, far);
     Number change = -far.work; // of the work with the window of close boxes
     if (any(close > zero)) {
-        const Wrench boxes = boxes_wrench(p, m, e), ball = ball_wrench(p, m, e);
+        const Wrench boxes = boxes_wrench(p, moments), ball = ball_wrench(p, m, e);
         sum.add(close, boxes);
         sum.add(-close, ball);
         change += boxes.work - ball.work;

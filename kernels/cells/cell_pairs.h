@@ -1,11 +1,13 @@
 // Corrections of the field and force between near cells of different bodies, H_i += T_ij m_j.
 //
 // The sums over pairs treat a cell as a ball. Here the cells are boxes, and T_ij is the difference (``box_pair.h``).
-// Entries are in the frame of box i: the box's axes are the axes of its body's grid. They are computed again when the
-// relative pose of their bodies has changed.
+// Balls near cells take part, too; their frame is the world.
+// Rows are in the frame of box i and columns in that of box j: a box's axes are the axes of its body's grid. They are
+// computed again when the relative pose of their bodies has changed.
 //
-// From Python: HARDENING, the demagnetizing factor added to a cell inside another body; MARGIN, by how many radii a
-// cell may move before candidates are searched again; MU0; and the constants of ``box_pair.h``.
+// From Python: HARDENING, the demagnetizing factor added to a cell inside another body, and STEEPNESS, its inverse
+// depth for all of it; MARGIN, by how many radii a cell may move before candidates are searched again; MU0; and the
+// constants of ``box_pair.h``.
 // ``CellPairs`` is the struct of cell_pairs.py.
 #pragma once
 #include "cells/box_pair.h"
@@ -14,23 +16,19 @@
 
 namespace warpmag {
 
-constexpr int TENSOR_ROWS = 6, POSE_ROWS = 7; // xx, yy, zz, xy, yz, zx; position and quaternion of box j
-constexpr Real POSE_TOLERANCE = Real(3e-5);   // largest change of a pose, in sizes, that counts as rest
+constexpr int MATRIX_ROWS = 9, DETAIL_ROWS = 27; // of means; of, at and between differences; as in cell_pairs.py
+constexpr int POSE_ROWS = 7;                     // position and quaternion of box j
+constexpr Real BALL = Real(4.1887902047863905);  // volume of a ball over r³
+constexpr Real POSE_TOLERANCE = Real(3e-5);      // largest change of a pose, in sizes, that counts as rest
 
 constexpr int CLASSES = 16, BINS = CLASSES * CLASSES; // of rows by their numbers of close and of all candidates
 
-enum CellPairPass { LOCATE, CLEAR, SELECT, ARRANGE, ASSIGN, TABULATE, ADD_FIELD, ADD_FORCE }; // as in cell_pairs.py
+enum CellPairPass { LOCATE, CLEAR, SELECT, ARRANGE, ASSIGN, TABULATE, TAKE_BALLS, ADD_FIELD, ADD_FORCE };
+// as in cell_pairs.py
 
 // Writes the frame of body i, and raises a flag if cell i has moved so far that candidates are searched again.
 template <class Pairs> CUDA_CALLABLE inline void locate(const Pairs& a, int i) {
-    if (i < a.frame.shape[0]) {
-        const auto &b = a.rotation.data[i], &g = a.grid.data[i];
-        auto& q = a.frame.data[i];
-        q[0] = b[3] * g[0] + b[0] * g[3] + b[1] * g[2] - b[2] * g[1];
-        q[1] = b[3] * g[1] + b[1] * g[3] + b[2] * g[0] - b[0] * g[2];
-        q[2] = b[3] * g[2] + b[2] * g[3] + b[0] * g[1] - b[1] * g[0];
-        q[3] = b[3] * g[3] - b[0] * g[0] - b[1] * g[1] - b[2] * g[2];
-    }
+    if (i < a.grid.shape[0]) put_product(a.rotation.data[i], a.grid.data[i], a.frame.data[i]);
     if (i >= a.group.shape[0] || a.group.data[i] < 0) return;
     const Real* const row = (const Real*)a.packed.data + i;
     const size_t pitch = a.packed.strides[0] / sizeof(Real);
@@ -80,6 +78,8 @@ template <class Pairs> CUDA_CALLABLE inline void select(const Pairs& a, int i) {
     if (count > a.candidate.shape[1]) raise_flag(*a.crowded.data);
     if (count == 0 || count > a.candidate.shape[1]) return;
     const int close = part_candidates(a, i, count);
+    a.close_count.data[i] = close;
+    if (close > a.close_capacity) raise_flag(*a.crowded.data);
     a.bin.data[i] = CLASSES * class_of((close + 1) / 2) + class_of(count / 16);
     increment(a.bin_end.data + a.bin.data[i]);
 }
@@ -130,12 +130,16 @@ template <class Pairs> struct PairReader {
         const size_t cells = a.half.strides[0] / sizeof(Real);
         Boxes b;
         b.half = {gather(a.half.data, c.at), gather(a.half.data + cells, c.at), gather(a.half.data + 2 * cells, c.at)};
-        int body[WIDTH];
-        for (int l = 0; l < WIDTH; ++l) body[l] = 4 * a.body.data[c.at[l]];
+        int body[WIDTH], is_box[WIDTH], none[WIDTH] = {};
+        for (int l = 0; l < WIDTH; ++l) {
+            body[l] = 4 * a.body.data[c.at[l]];
+            is_box[l] = a.body.data[c.at[l]] < a.grid.shape[0];
+        }
         const Real* const frames = (const Real*)a.frame.data;
         for (int k = 0; k < 4; ++k) b.q[k] = gather(frames + k, body);
         b.radius = row(3, c);
-        b.volume = 8 * b.half.x * b.half.y * b.half.z;
+        b.ball = mask_of(indices(is_box) == indices(none));
+        b.volume = b.ball ? BALL * b.radius * b.radius * b.radius : 8 * b.half.x * b.half.y * b.half.z;
         b.size = gather(a.half.data + 3 * cells, c.at);
         return b;
     }
@@ -160,21 +164,25 @@ template <class Pairs> struct PairReader {
     }
 };
 
-// Writes tensors where pairs have moved, 0 where they are not near.
-CUDA_CALLABLE inline void put_tensor(Real* rows, const Symmetric& t, Mask moved, Mask near) {
-    const Number components[TENSOR_ROWS] = {t.xx, t.yy, t.zz, t.xy, t.yz, t.zx}, zero = t.xx * Real(0);
-    for (int k = 0; k < TENSOR_ROWS; ++k) {
+// Writes numbers where pairs have moved, 0 where they are not near.
+CUDA_CALLABLE inline void put_moved(Real* rows, const Number* values, int count, Number factor, Mask moved, Mask near) {
+    for (int k = 0; k < count; ++k) {
         Real* const row = rows + k * CHUNK;
-        put(row, moved ? (near ? components[k] : zero) : numbers(row));
+        put(row, moved ? (near ? factor * values[k] : factor * Real(0)) : numbers(row));
     }
 }
-CUDA_CALLABLE inline Symmetric tensor_at(const Real* rows) {
-    return {numbers(rows),
-            numbers(rows + CHUNK),
-            numbers(rows + 2 * CHUNK),
-            numbers(rows + 3 * CHUNK),
-            numbers(rows + 4 * CHUNK),
-            numbers(rows + 5 * CHUNK)};
+CUDA_CALLABLE inline Vector matrix_times(const Real* rows, Vector v) {
+    auto row_times = [&](int k) {
+        const Real* const row = rows + 3 * k * CHUNK;
+        return numbers(row) * v.x + numbers(row + CHUNK) * v.y + numbers(row + 2 * CHUNK) * v.z;
+    };
+    return {row_times(0), row_times(1), row_times(2)};
+}
+// Vectors of cells in an array of vectors.
+CUDA_CALLABLE inline Vector vectors_of(const Real* array, const Cells& cells) {
+    int place[WIDTH];
+    for (int l = 0; l < WIDTH; ++l) place[l] = 3 * cells.at[l];
+    return {gather(array, place), gather(array + 1, place), gather(array + 2, place)};
 }
 
 // Stores relative poses that have changed; returns where they have.
@@ -211,12 +219,18 @@ template <class Pairs> CUDA_CALLABLE inline void tabulate(const Pairs& a, int ro
         if (!any(moved)) continue;
         const BoxPair pair = box_pair(box, other_box, pose, listed, precedes(own, other));
         const Mask near = pair.window.value > Real(0);
-        const Number zero = pair.unit * Real(0), cube = pair.unit * pair.unit * pair.unit;
-        Symmetric tensor = {zero, zero, zero, zero, zero, zero};
-        if (any(near)) tensor = pair.window.value * cube * pair_tensor(pair);
-        put_tensor(slot_at(a.tensor.data, reader.capacity, TENSOR_ROWS, slot, row), tensor, moved, near);
+        const Number factor = pair.window.value * pair.unit * pair.unit * pair.unit;
+        PairMatrices matrices;
+        if (any(near)) matrices = pair_matrices(pair);
+        put_moved(slot_at(a.matrix.data, reader.capacity, MATRIX_ROWS, slot, row), matrices.means, 9, factor, moved,
+                  near);
+        if (slot >= a.close_capacity) continue;
+        Real* const detail = slot_at(a.detail.data, a.close_capacity, DETAIL_ROWS, slot, row);
+        put_moved(detail, matrices.of_differences, 9, factor, moved, near);
+        put_moved(detail + 9 * CHUNK, matrices.at_differences, 9, factor, moved, near);
+        put_moved(detail + 18 * CHUNK, matrices.differences, 9, factor, moved, near);
     }
-    depth = smaller(group_sum(depth), depth * Real(0) + 1);
+    depth = smaller(STEEPNESS * group_sum(depth), depth * Real(0) + 1);
     if (share() == 0) put(a.hardness.data + row, HARDENING * depth / box.volume);
 }
 
@@ -240,19 +254,27 @@ template <class Pairs> CUDA_CALLABLE inline void add_field(const Pairs& a, int r
     if (slots == 0) return;
     const Rotation<Number> frame = rotation_of<Number>(reader.boxes(own).q);
     const Number zero = frame.rows[0][0] * Real(0);
-    const Real* const moments = (const Real*)a.moments.data;
-    Vector h = {zero, zero, zero};
+    const Real *const means = (const Real*)a.means.data, *const differences = (const Real*)a.differences.data;
+    int close_counts[WIDTH];
+    for (int l = 0; l < WIDTH; ++l) close_counts[l] = counts[l] == 0 ? 0 : a.close_count.data[own.at[l]];
+    const int close = largest_count(close_counts) < a.close_capacity ? largest_count(close_counts) : a.close_capacity;
+    Vector h = {zero, zero, zero}, g = h;
     for (int slot = share(); slot < slots; slot += SHARES) {
-        int place[WIDTH];
         const Cells other = reader.candidates(own, counts, slot);
-        for (int l = 0; l < WIDTH; ++l) place[l] = 3 * other.at[l];
-        const Vector m = {gather(moments, place), gather(moments + 1, place), gather(moments + 2, place)};
-        h += tensor_at(slot_at(a.tensor.data, reader.capacity, TENSOR_ROWS, slot, row)) * to_body(frame, m);
+        const Vector m = vectors_of(means, other);
+        h += matrix_times(slot_at(a.matrix.data, reader.capacity, MATRIX_ROWS, slot, row), m);
+        if (slot >= close) continue;
+        const Real* const detail = slot_at(a.detail.data, a.close_capacity, DETAIL_ROWS, slot, row);
+        const Vector d = vectors_of(differences, other);
+        h += matrix_times(detail, d);
+        g += matrix_times(detail + 9 * CHUNK, m) + matrix_times(detail + 18 * CHUNK, d);
     }
-    int place[WIDTH];
-    for (int l = 0; l < WIDTH; ++l) place[l] = 3 * own.at[l];
-    const Vector m = {gather(moments, place), gather(moments + 1, place), gather(moments + 2, place)};
-    add_to_cells((Real*)a.h.data, own, counts, to_world(frame, group_sums(h)) - numbers(a.hardness.data + row) * m, 1);
+    const Number hardness = numbers(a.hardness.data + row);
+    h = group_sums(h) - hardness * vectors_of(means, own);
+    g = group_sums(g);
+    for (int l = 0; l < WIDTH; ++l) counts[l] = a.inducible.data[own.at[l]] ? counts[l] : 0;
+    add_to_cells((Real*)a.h.data, own, counts, to_world(frame, h), 1);
+    add_to_cells((Real*)a.difference_field.data, own, counts, g, 1);
 }
 
 // Adds forces [N] and torques [N·m] to the rows' cells.
@@ -265,6 +287,8 @@ template <class Pairs> CUDA_CALLABLE inline void add_force(const Pairs& a, int r
     const Boxes box = reader.boxes(own);
     const Rotation<Number> frame = rotation_of<Number>(box.q);
     const Vector x = reader.position(own), m = to_body(frame, reader.moment(own));
+    const Real* const differences = (const Real*)a.differences.data;
+    const Vector difference = vectors_of(differences, own);
     const Number zero = box.size * Real(0);
     Vector force = {zero, zero, zero}, torque = force;
     for (int slot = share(); slot < slots; slot += SHARES) {
@@ -276,14 +300,26 @@ template <class Pairs> CUDA_CALLABLE inline void add_force(const Pairs& a, int r
         const Mask near = pair.window.value > Real(0);
         if (!any(near)) continue;
         const Number cube = pair.unit * pair.unit * pair.unit;
-        const Wrench wrench = pair_wrench(pair, m, cube * to_body(frame, reader.moment(other)));
+        const PairMoments moments = {m, cube * to_body(frame, reader.moment(other)), difference,
+                                     cube * vectors_of(differences, other)};
+        const Wrench wrench = pair_wrench(pair, moments);
         add_where(near, force, pair.unit * wrench.force);
         add_where(near, torque, wrench.torque);
     }
-    int movable[WIDTH];
-    for (int l = 0; l < WIDTH; ++l) movable[l] = a.movable.data[own.at[l]] ? counts[l] : 0;
-    add_to_cells((Real*)a.forces.data, own, movable, to_world(frame, group_sums(force)), MU0);
-    add_to_cells((Real*)a.torques.data, own, movable, to_world(frame, group_sums(torque)), MU0);
+    int moved[WIDTH], turned[WIDTH];
+    for (int l = 0; l < WIDTH; ++l) {
+        moved[l] = a.movable.data[own.at[l]] ? counts[l] : 0;
+        turned[l] = a.rotatable.data[own.at[l]] ? moved[l] : 0;
+    }
+    add_to_cells((Real*)a.forces.data, own, moved, to_world(frame, group_sums(force)), MU0);
+    add_to_cells((Real*)a.torques.data, own, turned, to_world(frame, group_sums(torque)), MU0);
+}
+
+// Writes the moment of moment i if it is a ball.
+template <class Pairs> CUDA_CALLABLE inline void take_ball(const Pairs& a, int i) {
+    if (i >= a.group.shape[0] || a.body.data[i] < a.grid.shape[0]) return;
+    const Real* const m = (const Real*)a.packed.data + 4 * (a.packed.strides[0] / sizeof(Real)) + i;
+    for (int k = 0; k < 3; ++k) ((Real*)a.means.data)[3 * (size_t)i + k] = m[k * (a.packed.strides[0] / sizeof(Real))];
 }
 
 // The passes that arrange rows after a search.
@@ -297,7 +333,7 @@ template <class Pairs> CUDA_CALLABLE inline void arrange_rows(const Pairs& a, in
 }
 
 template <class Pairs> CUDA_CALLABLE inline void make_cell_pair_pass(const Pairs& a, int pass, int i) {
-    if (pass >= TABULATE) {
+    if (pass >= TABULATE && pass != TAKE_BALLS) {
         if (i >= a.cell.shape[0]) return;
         if (pass == TABULATE) tabulate(a, i);
         else if (pass == ADD_FIELD) add_field(a, i);
@@ -306,6 +342,7 @@ template <class Pairs> CUDA_CALLABLE inline void make_cell_pair_pass(const Pairs
     }
     for (int l = 0; l < WIDTH && share() == 0; ++l)
         if (pass == LOCATE) locate(a, i + l);
+        else if (pass == TAKE_BALLS) take_ball(a, i + l);
         else arrange_rows(a, pass, i + l);
 }
 

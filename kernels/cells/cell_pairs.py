@@ -3,7 +3,7 @@
 The sums over pairs treat a cell as a ball, which is wrong for neighbors: a flat cell's ball reaches through a sheet. So
 cells that are near each other act on each other as boxes, at the present poses of their bodies (``cell_pairs.h``). The
 candidates are found by the neighbor search of ``pairs.neighbors``. The tensor of a pair is kept while the relative pose
-of its bodies rests.
+of its bodies rests. Balls act on cells by the average of their field and its difference between the halves of a cell.
 
 The operator of induction is positive for disjoint bodies: it is the exact one, integrated by Gauss points. For bodies
 that intersect the points can make it negative. So a cell inside another body gets an additional demagnetizing factor.
@@ -33,18 +33,27 @@ CLOSE = 1.75, 2.25
 HARDENING = 0.45
 """Demagnetizing factor added to a cell inside another body. Quadrature over intersecting boxes leaves eigenvalues of
 -0.05."""
+STEEPNESS = 2.0
+"""Depth inside other bodies from which a cell gets it whole: inverse, over the sum of the inscribed radii."""
 _LONGEST_LIST = 2048
 """Longest list of candidates. A face cell of a cube has 50 to 60, one in a stack of five sheets up to 500."""
+_LONGEST_CLOSE = 192
+"""Largest number of close candidates of a cell."""
+_BALL_REACH = 2.1
+"""Half side of the box that stands for a ball in the windows, in longest half sides of the cells of its world: nearer
+than 2.7 to 3.5 sides the field of a ball differs between the halves of a cell."""
+_MOST_BALLS = 400
+"""Largest number of balls near a cell: those at least as wide as a cell, packed densely on one side."""
 _SHORTEST_LIST = 64
 """Shortest list of candidates."""
 _SAMPLES = 32
 """Points whose neighbors are counted for the length of the lists."""
 _MARGIN = 0.5
 """Part of half its size that a cell may move before candidates are searched again."""
-LOCATE, CLEAR, SELECT, ARRANGE, ASSIGN, TABULATE, ADD_FIELD, ADD_FORCE = range(8)
+LOCATE, CLEAR, SELECT, ARRANGE, ASSIGN, TABULATE, TAKE_BALLS, ADD_FIELD, ADD_FORCE = range(9)
 """The passes, in order; as in ``cell_pairs.h``."""
-_TENSOR_ROWS, _POSE_ROWS = 6, 7
-"""Numbers of a tensor and of a relative pose; as in ``cell_pairs.h``."""
+_MATRIX_ROWS, _DETAIL_ROWS, _POSE_ROWS = 9, 27, 7
+"""Numbers of the matrices of a pair and of a relative pose; as in ``cell_pairs.h``."""
 _BINS = 256
 """Bins of rows by their numbers of candidates; as in ``cell_pairs.h``."""
 _CELLS_PER_THREAD = 100
@@ -59,22 +68,28 @@ def cell_pairs_type(dtype):
     @wp.struct
     class CellPairs:
         # Model:
-        group: wp.array[int]  # world of each moment, −1 for moments without a cell, shape [n]
-        body: wp.array[int]  # index of the body of each cell, shape [n]
+        group: wp.array[int]  # world of each moment that takes part, −1 for the others, shape [n]
+        body: wp.array[int]  # index of the body of each cell, b for balls, shape [n]
         half: wp.array2d[dtype]  # half sides of the boxes in the frame of the body's grid, and sizes [m], shape [4, n]
         grid: wp.array[quaternion]  # from the frame of each body's grid to that of the body, shape [b]
+        inducible: wp.array[int]  # 1 for inducible moments, shape [n]
         movable: wp.array[int]  # 1 where the force is evaluated, shape [n]
+        rotatable: wp.array[int]  # 1 where the torque is evaluated, too, shape [n]
         # Data in:
         rotation: wp.array[quaternion]  # from each body's frame to the world, shape [b]
         packed: wp.array2d[dtype]  # packed moments (``packing.PackedMoments``)
-        moments: wp.array[vec3]  # [A·m²], shape [n]
+        means: wp.array[vec3]  # mean moments of cells, frames of their grids, and of balls [A·m²], shape [n]
+        differences: wp.array[vec3]  # half differences of the halves of cells, like ``means``
         # Data out:
         h: wp.array[vec3]  # field to which corrections are added [A/m], shape [n]
+        difference_field: wp.array[vec3]  # half differences of the fields of halves, added to, frames of grids, [n]
         forces: wp.array[vec3]  # [N], shape [n]
         torques: wp.array[vec3]  # about the moments' positions [N·m], shape [n]
         crowded: wp.array[int]  # 1 if a cell had more candidates than its list holds, shape [1]
+        close_capacity: int  # close candidates of a cell with details
+        close_count: wp.array[int]  # number of close candidates, which come first, shape [n]
         # Work:
-        frame: wp.array[quaternion]  # from the frame of each body's grid to the world, shape [b]
+        frame: wp.array[quaternion]  # from the frame of each body's grid to the world, and the identity, shape [b + 1]
         candidate: wp.array2d[int]  # moments that are or may become near, shape [n, capacity]
         candidate_count: wp.array[int]  # their number, which may exceed the capacity, shape [n]
         found_at: wp.array[vec3]  # positions at the last search [m], shape [n]
@@ -88,7 +103,8 @@ def cell_pairs_type(dtype):
         hardness: wp.array[
             dtype
         ]  # demagnetizing factor added where bodies intersect, over the volume [1/m³], shape [c padded]
-        tensor: wp.array[dtype]  # T_ij [1/m³] in the frame of box i, shape [c padded / CHUNK, capacity, 6, CHUNK], flat
+        matrix: wp.array[dtype]  # T_ij of means [1/m³], shape [c padded / CHUNK, capacity, 9, CHUNK], flat
+        detail: wp.array[dtype]  # of, at and between differences [1/m³], [c padded / CHUNK, close_capacity, 27, CHUNK]
 
     return CellPairs
 
@@ -98,6 +114,7 @@ def _kernel(dtype, group: int):
     arguments = {**PASS_ARGUMENTS, "arrays": cell_pairs_type(dtype)}
     constants = dict(
         HARDENING=HARDENING,
+        STEEPNESS=STEEPNESS,
         CLOSE_BEGIN=CLOSE[0],
         CLOSE_END=CLOSE[1],
         WINDOW_BEGIN=WINDOW[0],
@@ -121,15 +138,26 @@ def _volume_factors(half_sides) -> np.ndarray:
     return (volumes / volumes.max()) ** 0.2
 
 
-def _list_length(bodies, group, reach: float) -> int:
+def _balls_among_cells(balls, radii, worlds, group, half) -> np.ndarray:
+    """Return the balls that are at least as wide as the longest cell of their world, and write their half sides."""
+    longest = np.zeros(worlds.max() + 1)
+    np.maximum.at(longest, worlds[group >= 0], half[:3, group >= 0].max(axis=0))
+    taken = np.flatnonzero(balls & (longest[worlds] > 0.0) & (radii >= longest[worlds]))
+    half[:3, taken] = _BALL_REACH * longest[worlds[taken]]
+    half[3, taken] = 2.0 * half[0, taken]
+    return taken
+
+
+def _list_length(bodies, group, balls, reach: float) -> int:
     """Return the length of lists for candidates up to ``reach`` [m]: all bodies of a world around a cell, or a solid.
 
-    Bodies that intersect can have more candidates.
+    ``balls`` are the indices of balls. Bodies that intersect can have more candidates.
     """
     near = {id(coupling): _most_near(coupling.positions, reach) for _, coupling in bodies}
     counts = np.zeros(group.max() + 1)
     np.add.at(counts, [group[first] for first, _ in bodies], [near[id(coupling)] for _, coupling in bodies])
-    solid = (
+    np.add.at(counts, group[balls], 1.0)
+    solid = _MOST_BALLS * (len(balls) > 0) + (
         4.0
         / 3.0
         * np.pi
@@ -165,11 +193,11 @@ class CellPairs:
         bodies: First moment and coupling of each body. A coupling has ``half_sides`` and ``grid_rotation`` of its cells
             (``warpmag.shapes.demagnetization``).
         takes_part: False for bodies whose near field has a closed form, shape [bodies].
-        rotations: Rotation from each body's frame to the world, Warp array, shape [bodies].
-        worlds: World of each moment, shape [n].
-        movable: True for moments whose force is evaluated, shape [n].
+        cells: The cells of the bodies (``couplings.CellCouplings``).
+        layout: Radii [m] and worlds of moments, ``single_balls``, which take part unless they are narrower than a cell,
+            and ``permanent`` and ``movable``, True for moments that are (``warpmag.moments.layout.MomentLayout``).
+        rotatable: Nonzero for moments whose torque is evaluated, Warp array, shape [n].
         packed: All moments, packed (``packing.PackedMoments``).
-        moments: Moments [A·m²], Warp array, shape [n].
         h: Field to add to [A/m], Warp array, shape [n].
         forces, torques: Forces [N] and torques [N·m] to add to, Warp arrays, shape [n].
 
@@ -177,20 +205,23 @@ class CellPairs:
         crowded: 1 if a cell had more candidates than a list holds and took no part, Warp array, shape [1].
     """
 
-    def __init__(self, bodies, takes_part, rotations, worlds, movable, packed, moments, h, forces, torques):
+    def __init__(self, bodies, takes_part, cells, layout, rotatable, packed, h, forces, torques):
         """Lay out the arrays on the device of the moments."""
+        self._cells, worlds = cells, layout.worlds
         dtype, device, n = packed.dtype, packed.device, packed.count
         group, body, half = np.full(n, -1), np.zeros(n, int), np.ones((4, n))
         for number, (first, coupling) in enumerate(bodies):
             if not takes_part[number]:
                 continue
-            cells = slice(first, first + len(coupling.radii))
+            span = slice(first, first + len(coupling.radii))
             sides = coupling.half_sides.T
-            group[cells], body[cells], half[:3, cells] = worlds[cells], number, sides
+            group[span], body[span], half[:3, span] = worlds[span], number, sides
             most, least = sides.max(axis=0), sides.min(axis=0)
-            half[3, cells] = 2.0 * most * np.sqrt(np.minimum(most / least, _FLATTEST)) * _volume_factors(sides)
+            half[3, span] = 2.0 * most * np.sqrt(np.minimum(most / least, _FLATTEST)) * _volume_factors(sides)
+        taken = _balls_among_cells(layout.single_balls, layout.radii, worlds, group, half)
+        group[taken], body[taken] = worlds[taken], len(bodies)
         ratio, reach = WINDOW[1] + _MARGIN, float(half[3, group >= 0].max())
-        capacity = _list_length([body for body in bodies if group[body[0]] >= 0], group, ratio * reach)
+        capacity = _list_length([body for body in bodies if group[body[0]] >= 0], group, taken, ratio * reach)
         padded = -(-int((group >= 0).sum()) // CHUNK) * CHUNK
 
         def put(values, kind=wp.int32):
@@ -205,18 +236,29 @@ class CellPairs:
         )  # fmt: skip
         self._pairs = a = cell_pairs_type(dtype)()
         quaternion = wp.types.quaternion(dtype)
-        a.group, a.body, a.half, a.movable = put(group), put(body), put(half, dtype), put(movable)
-        a.grid, a.rotation = put([coupling.grid_rotation for _, coupling in bodies], quaternion), rotations
-        a.packed, a.moments, a.h, a.forces, a.torques = packed.packed, moments, h, forces, torques
+        a.group, a.body, a.half, a.movable = put(group), put(body), put(half, dtype), put(layout.movable)
+        a.rotatable, a.inducible = rotatable, put(~layout.permanent)
+        a.grid, a.rotation = put([coupling.grid_rotation for _, coupling in bodies], quaternion), cells.rotations
+        a.packed, a.h, a.forces, a.torques = packed.packed, h, forces, torques
+        a.means, a.differences, a.difference_field = cells.means, cells.differences, cells.difference_field
         a.candidate, a.candidate_count, a.found_at = lists.neighbor, lists.count, lists.found_at
-        a.moved, a.searching, a.frame = lists.moved, lists.searching, zeros(len(bodies), kind=quaternion)
+        a.moved, a.searching, a.frame = (
+            lists.moved,
+            lists.searching,
+            put(np.tile([0.0, 0.0, 0.0, 1.0], (len(bodies) + 1, 1)), quaternion),
+        )
         self.crowded = a.crowded = zeros(1)
         a.rows, a.bin, a.bin_end = zeros(1), zeros(n), zeros(_BINS)
         a.cell, a.hardness = zeros(padded), zeros(padded, kind=dtype)
         a.pose = _large_zeros(padded * capacity * _POSE_ROWS, dtype, device)
-        a.tensor = _large_zeros(padded * capacity * _TENSOR_ROWS, dtype, device)
+        a.close_capacity, a.close_count = min(capacity, _LONGEST_CLOSE), zeros(n)
+        a.matrix = _large_zeros(padded * capacity * _MATRIX_ROWS, dtype, device)
+        a.detail = _large_zeros(padded * a.close_capacity * _DETAIL_ROWS, dtype, device)
         self._locate, self._tabulate = self._record(LOCATE, LOCATE), self._record(CLEAR, TABULATE)
-        self._field, self._force = self._record(ADD_FIELD, ADD_FIELD), self._record(ADD_FORCE, ADD_FORCE)
+        self._field, self._force = (
+            self._record(TAKE_BALLS if len(taken) else ADD_FIELD, ADD_FIELD),
+            self._record(ADD_FORCE, ADD_FORCE),
+        )
 
     def _record(self, first: int, last: int) -> list:
         """Return launches of passes ``first`` to ``last``: one on a CPU, one each on a GPU."""
@@ -240,16 +282,18 @@ class CellPairs:
             launch.launch()
 
     def add_field(self):
-        """Add the corrections to the field."""
+        """Add the corrections to the field, and the fields of differences to the cells' ``difference_field``."""
+        self._cells.spread()
         for launch in self._field:
             launch.launch()
 
     def add_forces(self):
         """Add the corrections to forces and torques."""
+        self._cells.spread()
         for launch in self._force:
             launch.launch()
 
     def persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays that the next search and the next evaluation read, by name."""
-        kept = ("rows", "cell", "pose", "tensor", "hardness", "crowded")
+        kept = ("rows", "cell", "pose", "matrix", "detail", "hardness", "crowded", "close_count")
         return neighbors.persistent_lists(self._lists) | {name: getattr(self._pairs, name) for name in kept}

@@ -1,8 +1,10 @@
-// Corrections of the field between cells of one body, H_i += Σ T_ij m_j, with tensors T_ij in the body's frame.
+// Cells of one body: the differences of their halves, and corrections of the field between them, H_i += Σ T_ij m_j.
 //
-// Three passes: TURN rotates moments into the frame of their body; SHARE computes the low-order fields that all cells
-// of a body share; ADD sums the tensors' fields and rotates them into the world. On a CPU a pass works on a
-// vector of cells, on a GPU a group of threads has one cell. ``Couplings`` is the struct of couplings.py.
+// SPREAD writes moments and half the difference D m of the halves of each cell (``warpmag.shapes.linear_cells``). SHARE
+// computes the field that all cells of a body share. TURN copies the fields of the differences by rows. ADD adds Dᵀ of
+// them, the tensors' fields, and the shared field. Everything is in the
+// frame of the body's grid. On a CPU a pass works on a vector of cells, on a GPU a group of threads has one cell.
+// ``Couplings`` is the struct of couplings.py.
 #pragma once
 #include "cells/rotation.h"
 #include "shared/active.h"
@@ -11,10 +13,9 @@
 
 namespace warpmag {
 
-constexpr int TENSOR = 6; // xx, yy, zz, xy, xz, yz
-constexpr int COMMON = 8; // low-order fields that all cells of a body share; as in couplings.py
+constexpr int TENSOR = 9; // rows of the tensor one after the other
 
-enum CellPass { TURN, SHARE, ADD }; // as in couplings.py
+enum CellPass { SPREAD, SHARE, TURN, ADD }; // as in couplings.py
 
 // Σ T_ij m_j of the cells at ``row`` of the tables. All lists of a chunk have the length of the longest.
 template <class Couplings>
@@ -29,84 +30,143 @@ CUDA_CALLABLE inline Vector sum_entries(const Couplings& c, const Real* const mo
         const Real* const t = c.tensor.data + (size_t)slot * (TENSOR * CHUNK) + lane;
         const Index j = indices(other);
         const Vector m = {collect(moments, j), collect(moments + pitch, j), collect(moments + 2 * pitch, j)};
-        const Number xx = numbers(t), yy = numbers(t + CHUNK), zz = numbers(t + 2 * CHUNK);
-        const Number xy = numbers(t + 3 * CHUNK), xz = numbers(t + 4 * CHUNK), yz = numbers(t + 5 * CHUNK);
-        h += Vector{xx * m.x + xy * m.y + xz * m.z, xy * m.x + yy * m.y + yz * m.z, xz * m.x + yz * m.y + zz * m.z};
+        auto row_times = [&](int k) {
+            const Real* const row = t + 3 * k * CHUNK;
+            return numbers(row) * m.x + numbers(row + CHUNK) * m.y + numbers(row + 2 * CHUNK) * m.z;
+        };
+        h += Vector{row_times(0), row_times(1), row_times(2)};
     }
     return group_sums(h);
 }
 
-// Low-order field at positions in a body: a[0..2] is a uniform field, a[3..7] are the coefficients of the linear fields
-// ∇(x² − z²)/2, ∇(y² − z²)/2, ∇xy, ∇xz and ∇yz.
-CUDA_CALLABLE inline Vector common_field(const Real* a, Vector position) {
-    const Number &x = position.x, &y = position.y, &z = position.z;
-    return {a[0] + a[3] * x + a[5] * y + a[6] * z, a[1] + a[5] * x + a[4] * y + a[7] * z,
-            a[2] + a[6] * x + a[7] * y - (a[3] + a[4]) * z};
-}
-
-// Coefficients of a body's low-order field: its matrix times the sums of zeroth and first order, Σ m and Σ x_k m_l.
+// Uniform field that all cells of a body share: C times the moment of the body.
 template <class Couplings> CUDA_CALLABLE inline void share_field(const Couplings& c, int body) {
     const auto& rows = c.rows.data[body]; // range of the body's rows
-    const int table = c.chunk.data[rows[0] / CHUNK][3] - rows[0];
-    const size_t pitch = c.body_moments.strides[0] / sizeof(Real), stride = c.position.strides[0] / sizeof(Real);
-    Vector sums[3] = {};
+    const size_t pitch = c.body_moments.strides[0] / sizeof(Real);
+    const Number zero = Number(Real(0));
+    Vector sum = {zero, zero, zero};
     for (int row = rows[0] + WIDTH * share(); row < rows[1]; row += WIDTH * SHARES) {
-        const Real *const own = c.body_moments.data + row, *const at = c.position.data + table + row;
-        const Vector m = {numbers(own), numbers(own + pitch), numbers(own + 2 * pitch)};
-        const Number x = numbers(at), y = numbers(at + stride), z = numbers(at + 2 * stride);
-        sums[0] += m;
-        sums[1] += Vector{x * m.x - z * m.z, y * m.y - z * m.z, x * m.y + y * m.x};
-        sums[2] += Vector{x * m.z + z * m.x, y * m.z + z * m.y, z * 0};
+        const Real* const own = c.body_moments.data + row;
+        sum += Vector{numbers(own), numbers(own + pitch), numbers(own + 2 * pitch)};
     }
-    for (Vector& sum : sums) sum = group_sums(sum);
+    sum = group_sums(sum);
     if (share() != 0) return;
-    Real totals[3 * 3] = {};
-    for (int lane = 0; lane < WIDTH; ++lane)
-        for (int k = 0; k < 3; ++k) {
-            totals[3 * k] += lane_of(sums[k].x, lane);
-            totals[3 * k + 1] += lane_of(sums[k].y, lane);
-            totals[3 * k + 2] += lane_of(sums[k].z, lane);
-        }
-    const Real* const matrix = c.matrix.data + (size_t)body * (COMMON * COMMON);
-    for (int k = 0; k < COMMON; ++k) {
-        Real strength = 0;
-        for (int l = 0; l < COMMON; ++l) strength += matrix[COMMON * k + l] * totals[l];
-        c.common.data[(size_t)body * COMMON + k] = strength;
+    Real total[3] = {};
+    for (int lane = 0; lane < WIDTH; ++lane) {
+        total[0] += lane_of(sum.x, lane);
+        total[1] += lane_of(sum.y, lane);
+        total[2] += lane_of(sum.z, lane);
     }
+    const Real* const matrix = c.matrix.data + 9 * (size_t)body;
+    for (int k = 0; k < 3; ++k)
+        c.common.data[3 * (size_t)body + k] =
+            matrix[3 * k] * total[0] + matrix[3 * k + 1] * total[1] + matrix[3 * k + 2] * total[2];
+}
+
+// Writes three rows of an array of cells from ``first`` on.
+template <class Array> CUDA_CALLABLE inline void put_row(const Array& array, int row, int first, Vector v) {
+    const size_t pitch = array.strides[0] / sizeof(Real);
+    Real* const at = array.data + first * pitch + row;
+    put(at, v.x);
+    put(at + pitch, v.y);
+    put(at + 2 * pitch, v.z);
+}
+
+// Cells of a vector: their first row, their number, their first moment, and the rows and moments of their body.
+struct CellSpan {
+    int row, count, i, body, first_row, table_row, first_moment;
+};
+template <class Couplings> CUDA_CALLABLE inline CellSpan cell_span(const Couplings& c, int row) {
+    const auto& chunk = c.chunk.data[row / CHUNK]; // first moment, count, first row of the body, first row of its table
+    const int offset = row % CHUNK, left = chunk[1] - offset;
+    return {row,      left < 0 ? 0 : left > WIDTH ? WIDTH : left, chunk[0] + offset, c.body.data[row / CHUNK], chunk[2],
+            chunk[3], chunk[0] + offset - (row - chunk[2])};
+}
+template <class Couplings> CUDA_CALLABLE inline Rotation<Real> frame_of(const Couplings& c, const CellSpan& at) {
+    Real q[4];
+    put_product(c.rotation.data[at.body], c.grid.data[at.body], q);
+    return rotation_of<Real>(q);
+}
+
+// Neighbors of the cells on a side, relative to their body, and the weights of the cells' own moments, of the
+// neighbors', and of the cells' moments in the differences of the neighbors.
+struct Neighbors {
+    Index j;
+    Number outward, inward, back;
+};
+template <class Couplings>
+CUDA_CALLABLE inline Neighbors neighbors_at(const Couplings& c, const CellSpan& at, int side) {
+    const size_t pitch = c.weight.strides[0] / sizeof(Real), row = at.table_row + (at.row - at.first_row);
+    const Index j = indices(c.side.data + side * (c.side.strides[0] / sizeof(int)) + row);
+    const Real *const weight = c.weight.data + side * pitch + row, *const inward = weight + 6 * pitch;
+    const Number own = numbers(weight), zero = own * 0;
+    const Number back = collect(c.weight.data + (6 + (side ^ 1)) * pitch + at.table_row, j);
+    return {j, own, numbers(inward), mask_of(own > zero) ? back : zero}; // a cell without a neighbor has itself
+}
+
+// Writes moments and half differences in the frame of the grid.
+template <class Couplings> CUDA_CALLABLE inline void spread(const Couplings& c, const CellSpan& at) {
+    const Rotation<Real> frame = frame_of(c, at);
+    const Real* const world = (const Real*)c.moments.data + 3 * (size_t)at.first_moment;
+    const Vector m = to_body(frame, vectors((const Real*)c.moments.data + 3 * (size_t)at.i, at.count));
+    Number difference[3] = {m.x * 0, m.x * 0, m.x * 0};
+    for (int side = 0; side < 6; ++side) {
+        const int k = side / 2;
+        const Neighbors other = neighbors_at(c, at, side);
+        const Index place = 3 * other.j;
+        const Number component = frame.rows[0][k] * collect(world, place) + frame.rows[1][k] * collect(world + 1, place)
+                                 + frame.rows[2][k] * collect(world + 2, place);
+        const Number change = other.inward * component - other.outward * (k == 0 ? m.x : k == 1 ? m.y : m.z);
+        difference[k] += (side % 2 ? Real(0.25) : Real(-0.25)) * change;
+    }
+    if (share() != 0) return;
+    put_row(c.body_moments, at.row, 0, m);
+    put_vectors((Real*)c.means.data + 3 * (size_t)at.i, at.count, m);
+    put_vectors((Real*)c.differences.data + 3 * (size_t)at.i, at.count, {difference[0], difference[1], difference[2]});
+    put_vectors((Real*)c.difference_field.data + 3 * (size_t)at.i, at.count, {m.x * 0, m.x * 0, m.x * 0});
+}
+
+// Writes the fields of differences by rows.
+template <class Couplings> CUDA_CALLABLE inline void turn(const Couplings& c, const CellSpan& at) {
+    if (share() == 0)
+        put_row(c.fields, at.row, 0, vectors((const Real*)c.difference_field.data + 3 * (size_t)at.i, at.count));
+}
+
+// Dᵀ of the field of differences.
+template <class Couplings> CUDA_CALLABLE inline Vector gathered(const Couplings& c, const CellSpan& at) {
+    const size_t pitch = c.fields.strides[0] / sizeof(Real);
+    Number h[3];
+    for (int k = 0; k < 3; ++k) {
+        const Real* const field = c.fields.data + k * pitch + at.first_row;
+        const Number own = numbers(c.fields.data + k * pitch + at.row);
+        h[k] = own * 0;
+        for (int side = 2 * k; side < 2 * k + 2; ++side) {
+            const Neighbors other = neighbors_at(c, at, side);
+            const Number sum = other.outward * own + other.back * collect(field, other.j);
+            h[k] += (side % 2 ? Real(-0.25) : Real(0.25)) * sum;
+        }
+    }
+    return {h[0], h[1], h[2]};
 }
 
 // Makes a pass over the cells from ``row`` on.
 template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Couplings& c, int pass, int row) {
-    const auto& chunk = c.chunk.data[row / CHUNK]; // first moment, count, first row of the body, first row of its table
-    const int offset = row % CHUNK, left = chunk[1] - offset, lane_count = left < 0 ? 0 : left > WIDTH ? WIDTH : left;
-    if (lane_count == 0) return;
-    const int i = chunk[0] + offset;
-    const int body = c.body.data[row / CHUNK];
+    const CellSpan at = cell_span(c, row);
+    if (at.count == 0) return;
+    if (pass == SPREAD) return spread(c, at);
+    if (pass == TURN) return turn(c, at);
     if (pass == SHARE) {
-        if (row == c.rows.data[body][0]) share_field(c, body);
+        if (row == c.rows.data[at.body][0]) share_field(c, at.body);
         return;
     }
-    const Rotation<Real> rotation = rotation_of<Real>(c.rotation.data[body]);
-    Real* const own = c.body_moments.data + row;
-    const size_t pitch = c.body_moments.strides[0] / sizeof(Real);
-    if (pass == TURN) {
-        const Vector m = to_body(rotation, vectors((const Real*)c.moments.data + 3 * (size_t)i, lane_count));
-        if (share() != 0) return;
-        put(own, m.x);
-        put(own + pitch, m.y);
-        put(own + 2 * pitch, m.z);
-        return;
-    }
-    const int table_row = row - chunk[2] + chunk[3];
-    const Vector sums = sum_entries(c, c.body_moments.data + chunk[2], table_row);
+    const int table_row = at.table_row + (row - at.first_row);
+    const Vector sums = sum_entries(c, c.body_moments.data + at.first_row, table_row);
     if (share() != 0) return;
-    const size_t stride = c.position.strides[0] / sizeof(Real);
-    const Real* const at = c.position.data + table_row;
-    const Vector position = {numbers(at), numbers(at + stride), numbers(at + 2 * stride)};
-    const Vector common = common_field(c.common.data + (size_t)body * COMMON, position);
-    const Vector h = sums + common;
-    Real* const field = (Real*)c.h.data + 3 * (size_t)i;
-    put_vectors(field, lane_count, vectors(field, lane_count) + to_world(rotation, h));
+    const Real* const common = c.common.data + 3 * (size_t)at.body;
+    const Number zero = Number(Real(0));
+    const Vector shared = {zero + common[0], zero + common[1], zero + common[2]};
+    Real* const h = (Real*)c.h.data + 3 * (size_t)at.i;
+    put_vectors(h, at.count, vectors(h, at.count) + to_world(frame_of(c, at), gathered(c, at) + sums + shared));
 }
 
 template <class Word, class Couplings>

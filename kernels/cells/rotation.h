@@ -16,6 +16,13 @@ template <class N, class Quaternion> CUDA_CALLABLE inline Rotation<N> rotation_o
              {2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)},
              {2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)}}};
 }
+// Product of two quaternions: the rotation b, then a.
+template <class A, class B, class Result> CUDA_CALLABLE inline void put_product(const A& a, const B& b, Result& q) {
+    q[0] = a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1];
+    q[1] = a[3] * b[1] + a[1] * b[3] + a[2] * b[0] - a[0] * b[2];
+    q[2] = a[3] * b[2] + a[2] * b[3] + a[0] * b[1] - a[1] * b[0];
+    q[3] = a[3] * b[3] - a[0] * b[0] - a[1] * b[1] - a[2] * b[2];
+}
 template <class N> CUDA_CALLABLE inline Vector to_world(const Rotation<N>& r, Vector v) {
     const auto& a = r.rows;
     return {a[0][0] * v.x + a[0][1] * v.y + a[0][2] * v.z, a[1][0] * v.x + a[1][1] * v.y + a[1][2] * v.z,

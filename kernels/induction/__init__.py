@@ -6,7 +6,6 @@ May import ``shared``, ``material``, ``pairs`` and ``cells``.
 |---|---|
 | solve_state | state of a solve for every dynamics, worlds, convergence |
 | theta_flow | accelerated θ flow, the default dynamics |
-| body_response | collective response of bodies of few cells |
 | submagnetization | baseline dynamics by pairs of submagnetizations |
 | energy | energy in equilibrium |
 | tangent | linear solve at an equilibrium, for gradients |

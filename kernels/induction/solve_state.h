@@ -15,7 +15,7 @@ template <class State> CUDA_CALLABLE inline void begin_world(State& state, int w
     if (world.active) state.condition.data[0] = 1;
     world.evaluations = world.has_change = world.plain_steps = 0;
     world.next = world.active && state.warm.data[w] == STEADY ? STEP_AND_SWEEP : NOTHING;
-    world.best = -1.0, world.damping = 1.0;
+    world.best = -1.0;
     if (state.warm.data[w] == 0) world.change_count = 0, world.slowness = 0.0;
 }
 

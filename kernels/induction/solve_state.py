@@ -34,7 +34,6 @@ class World:
     used: int  # number of changes that the next step mixes
     is_best: int  # 1 if the last iterate is the best so far
     plain_steps: int  # steps left without mixing
-    damping: wp.float64  # factor of the moments' step lengths
     ahead: wp.float64  # factor β of the last change from solve to solve in the next start
     best: wp.float64  # smallest merit of this solve, negative before the first evaluation
     alpha: wp.types.vector(DEPTH, wp.float64)  # Anderson coefficients
@@ -62,8 +61,8 @@ def state_type(dtype):
         slope: wp.array[dtype]
         curve: wp.array[int]
         common_curve: int
+        within_bodies: int  # 1 if moments of one body are neighbors and overlap, 0 if they act by tensors alone
         curve_tables: wp.array2d[dtype]
-        responds: wp.array[int]  # 1 for cells of bodies with a collective response (``body_response``), shape [n]
         rtol: wp.float64  # error at which a world ends
         max_evaluations: int  # field evaluations after which a world ends unconverged
         row: wp.array[wp.vec4i]  # moment, world, and range of the world's inducible moments, shape [m]
@@ -143,12 +142,12 @@ def allocate(worlds, inducible, dtype, device):
         **zeros("worlds", world_count, World),
         **zeros("residual error", world_count, wp.float64),
         **zeros("arrived resting warm evaluations", world_count),
-        **zeros("responds", n),
         **zeros("condition", 1),
     }
     state = state_type(dtype)()
     for name, array in arrays.items():
         setattr(state, name, array)
+    state.within_bodies = 1
     return state
 
 

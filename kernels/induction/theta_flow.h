@@ -2,8 +2,7 @@
 // theta_flow.py has its equations; theta_step.h chooses the next step of a world.
 //
 // On a CPU a pass works on a vector of moments of one world; on a GPU a group of threads works on one moment. Takes
-// CAPACITY, DEPTH, GROUP and INVERSE_4PI from Python. RESPONDING is 1 if any moments belong to bodies with a collective
-// response (body_response.h). ``State`` is the struct of solve_state.py.
+// CAPACITY, DEPTH, GROUP and INVERSE_4PI from Python. ``State`` is the struct of solve_state.py.
 #pragma once
 #include "induction/theta_step.h"
 #include "material/curves.h"
@@ -96,25 +95,13 @@ template <class State> CUDA_CALLABLE inline void store_moments(State& state, con
     put_first(entries(state.packed, at, 6), at.count, m.z);
 }
 
-// Mask of moments that are cells of a body with a collective response (body_response.h).
-template <class State> CUDA_CALLABLE inline Mask responding(const State& state, const Span& at) {
-    Index flags = 0;
-#if defined(__CUDA_ARCH__)
-    if constexpr (RESPONDING) flags = state.responds.data[at.i];
-#else
-    for (int l = 0; RESPONDING && l < at.count; ++l) flags[l] = state.responds.data[at.i + l];
-#endif
-    return mask_of(flags != Index(0));
-}
-// True if moments i and j are cells of the same body with a collective response.
-template <class State> CUDA_CALLABLE inline bool respond_together(const State& state, int i, int j) {
-    if (!RESPONDING || state.responds.data[i] == 0) return false;
+// True if moments i and j act on each other as balls in sweeps: few moments in place of a body do not.
+template <class State> CUDA_CALLABLE inline bool are_balls(const State& state, int i, int j) {
     const Real* const labels = (const Real*)((const char*)state.packed.data + 7 * (size_t)state.packed.strides[0]);
-    return labels[i] == labels[j];
+    return state.within_bodies || labels[i] != labels[j];
 }
 
-// Calls visit(rows, mask) for the inducible neighbors of moments, except cells of the same body with a collective
-// response. A moment whose list overflowed has no neighbors.
+// Calls visit(rows, mask) for the inducible neighbors of moments. A moment whose list overflowed has no neighbors.
 #if defined(__CUDA_ARCH__)
 template <class State, class Visit>
 CUDA_CALLABLE inline void visit_neighbors(const State& state, const Span& at, Visit visit) {
@@ -122,7 +109,7 @@ CUDA_CALLABLE inline void visit_neighbors(const State& state, const Span& at, Vi
     const int count = state.neighbor_count.data[at.i];
     for (int s = share(); s < (count > CAPACITY ? 0 : count); s += SHARES) {
         const int j = list[s], row = j - at.i + at.row;
-        if (j >= at.begin && j < at.end && !respond_together(state, at.i, j)) visit(&row, true);
+        if (j >= at.begin && j < at.end && are_balls(state, at.i, j)) visit(&row, true);
     }
 }
 #else
@@ -143,7 +130,7 @@ template <class State> inline void list_neighbors(State& state, const Span& at) 
         const int i = at.i + l, length = state.neighbor_count.data[i];
         for (int s = 0; s < length && length <= CAPACITY; ++s) {
             const int j = state.neighbor.data[(size_t)CAPACITY * i + s];
-            if (j >= at.begin && j < at.end && !respond_together(state, i, j))
+            if (j >= at.begin && j < at.end && are_balls(state, i, j))
                 lists[CHUNK * counts[l]++ + l] = j - at.i + at.row;
         }
     }
@@ -155,9 +142,8 @@ template <class State> inline void list_neighbors(State& state, const Span& at) 
 #endif
 
 // Step lengths ω of moments.
-template <class State, class World>
-CUDA_CALLABLE inline Number step_of(const State& state, const Span& at, const World& world) {
-    return (Real)world.damping * numbers_or(entries(state.step, at), at.count, 1);
+template <class State> CUDA_CALLABLE inline Number step_of(const State& state, const Span& at) {
+    return numbers_or(entries(state.step, at), at.count, 1);
 }
 
 // Volume that balls share with other inducible balls, o_i = Σ_j |B_i ∩ B_j|/√(V_i V_j).
@@ -165,38 +151,29 @@ CUDA_CALLABLE inline Number step_of(const State& state, const Span& at, const Wo
 // The field energy of uniformly magnetized balls is at most ½μ0 ∫‖Σ M_i‖². The eigenvalues of the coupling therefore
 // lie above 1/3 − (1 + max o_i), which is −2/3 without overlap. In the metric of 2/3 + o_i they lie above −1, since the
 // matrix of shared volumes is bounded by the diagonal matrix of its row sums. The resulting step lengths converge for
-// any arrangement, and are short only where balls overlap. Cells of one body with a collective response do not overlap.
+// any arrangement, and are short only where balls overlap.
 template <class State> CUDA_CALLABLE inline Number total_overlap(const State& state, const Span& at) {
     const Real* const labels = entries(state.packed, at, 7) - at.i;
-    const Mask responds = responding(state, at), all = mask_of(Index(0) == Index(0));
+    const bool within = state.within_bodies;
     auto others = [=](Index i, Index j) {
-        return mask_of(j != i) & (responds ? mask_of(collect(labels, i) != collect(labels, j)) : all);
+        return within ? mask_of(j != i) : mask_of(collect(labels, i) != collect(labels, j));
     };
     return shared_volumes(state, at.i, at.count, at.begin, at.end, others);
 }
 
-// 4π times the neighbors' field [A/m] at the last solution plus ``ahead`` times its last change. Cells of bodies with a
-// collective response subtract the neighbors' field at present positions, since sweeps do not add it.
+// 4π times the neighbors' field [A/m] at the last solution plus ``ahead`` times its last change.
 template <class State>
 CUDA_CALLABLE inline Vector extrapolated_field(const State& state, const Span& at, Four ball, Real ahead) {
-    const Real *const past = (const Real*)state.past.data, *const packed = (const Real*)state.packed.data;
-    const size_t pitch = state.packed.strides[0] / sizeof(Real);
+    const Real* const past = (const Real*)state.past.data;
     const Vector x0 = vector_of(own_four(past, 0, at.row)), x1 = vector_of(own_four(past, 2, at.row));
-    const Mask responds = responding(state, at);
     Vector total = {0, 0, 0};
     visit_neighbors(state, at, [&](const int* j, Mask listed) {
         const Four y0 = four_at(past, 0, j), y1 = four_at(past, 2, j);
         const Vector m0 = vector_of(four_at(past, 1, j)), m1 = vector_of(four_at(past, 3, j));
-        Vector last = {0, 0, 0}, earlier = {0, 0, 0}, present = {0, 0, 0};
+        Vector last = {0, 0, 0}, earlier = {0, 0, 0};
         add_pair_field(last, x0 - vector_of(y0), ball.w, y0.w, m0, listed);
         add_pair_field(earlier, x1 - vector_of(y1), ball.w, y1.w, m1, listed);
         total += (last + ahead * (last - earlier));
-        if (!any(responds)) return;
-        const Index n = indices(j) + (at.i - at.row);
-        const Vector y = {collect(packed, n), collect(packed + pitch, n), collect(packed + 2 * pitch, n)};
-        const Vector m = m0 + ahead * (m0 - m1);
-        add_pair_field(present, vector_of(ball) - y, ball.w, y0.w, m, listed & responds);
-        total -= present;
     });
     return group_sums(total);
 }
@@ -249,8 +226,8 @@ template <class State> CUDA_CALLABLE inline void sweep(State& state, const Span&
     const Material material = material_of(state, at);
     const Vector s = get(state.s, at);
     const Vector g = get(state.mixed_g, at) + INVERSE_4PI * material.slope / material.saturation * h;
-    const Number step = smaller(Real(SWEEP_STEP) * step_of(state, at, world), Number(Real(1))), zero = step * 0;
-    const Vector next = s + (responding(state, at) ? zero : step) * (g - s);
+    const Number step = smaller(Real(SWEEP_STEP) * step_of(state, at), Number(Real(1)));
+    const Vector next = s + step * (g - s);
     set(state.s, at, next);
     const Vector m = moments_of(material, ball.w, next);
     if (last) {
@@ -292,7 +269,7 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     const Wide merit = weight * wide(length(r));
     put(DEVIATION, deviation * deviation);
     put(GOAL, goal * goal);
-    const Wide left = merit * wide(2 - whole_step<Real>(step_of(state, at, world)));
+    const Wide left = merit * wide(2 - whole_step<Real>(step_of(state, at)));
     put(MERIT, merit * merit);
     put(LEFT, left * left);
     put(CHANGE, square * wide_dot(step, step));
@@ -349,8 +326,8 @@ template <class State> CUDA_CALLABLE inline void advance(State& state, const Spa
             r -= alpha * get(state.history_r, at, slot);
         }
     }
-    const Number omega = step_of(state, at, world), whole = whole_step<Real>(omega);
-    const Vector g = mixed + r, next = mixed + (responding(state, at) ? whole : omega) * r;
+    const Number omega = step_of(state, at), whole = whole_step<Real>(omega);
+    const Vector g = mixed + r, next = mixed + omega * r;
     const Material material = material_of(state, at);
     set(state.s, at, next);
     // A converged world returns moments and field of a whole step, on the curve; s starts the next solve.

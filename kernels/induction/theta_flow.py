@@ -44,16 +44,12 @@ and ignores noise.
 The changes Δs_j, Δr_j are kept for the next solve, since the coupling hardly changes. A slow mode, such as that of long
 columns of balls, then costs one evaluation instead of three. Balls Up, where 243 balls jump, takes 1.2 evaluations per
 solve. The solve converges to the same solution from any start.
-
-Bodies of few cells respond collectively to each evaluated field (``body_response``). The flow then uses the field after
-their response, and takes whole steps for them, as for isolated balls. Sweeps exclude them.
 """
 
 from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.induction.body_response import BodyResponses
 from warpmag.kernels.induction.solve_state import COLUMNS, DEPTH, largest_chunk, state_type, world_summation
 from warpmag.kernels.material.curves import inverse_curve_ratio
 from warpmag.kernels.pairs.neighbors import CAPACITY
@@ -69,25 +65,25 @@ _RESIDENT_BLOCKS = {wp.float32: (3, 5), wp.float64: (2, 3)}
 """Blocks of 256 threads per multiprocessor at the start and in sweeps; limits the registers that compilers use."""
 
 
-def _constants(group: int, responding: bool) -> dict:
-    constants = {"GROUP": group, "CAPACITY": CAPACITY, "DEPTH": DEPTH, "RESPONDING": int(responding)}
+def _constants(group: int) -> dict:
+    constants = {"GROUP": group, "CAPACITY": CAPACITY, "DEPTH": DEPTH}
     return constants | {"INVERSE_4PI": INVERSE_4PI}
 
 
-def _options(dtype, group: int, responding: bool) -> dict:
-    return native_options("induction/theta_flow.h", dtype=dtype, **_constants(group, responding))
+def _options(dtype, group: int) -> dict:
+    return native_options("induction/theta_flow.h", dtype=dtype, **_constants(group))
 
 
 @cache
-def _passes_kernel(dtype, responding: bool):
+def _passes_kernel(dtype):
     """Return the kernel of all passes on a CPU."""
     call = "theta_flow(first, last, threads, team.data, arrays)"
     arguments = {**PASS_ARGUMENTS, "arrays": state_type(dtype)}
-    return native_kernel(call, "induction/theta_flow.h", arguments, dtype=dtype, **_constants(1, responding))
+    return native_kernel(call, "induction/theta_flow.h", arguments, dtype=dtype, **_constants(1))
 
 
 @cache
-def _begin_kernel(dtype, group: int, responding: bool, blocks: int):
+def _begin_kernel(dtype, group: int, blocks: int):
     """Return the kernel that starts a solve; ``blocks`` blocks share a chunk."""
     state_struct = state_type(dtype)
 
@@ -97,7 +93,7 @@ def _begin_kernel(dtype, group: int, responding: bool, blocks: int):
     @wp.func_native("warpmag::begin_world(state, w);")
     def begin_world(state: state_struct, w: int): ...
 
-    bounds, options = (256, _RESIDENT_BLOCKS[dtype][0]), _options(dtype, group, responding)
+    bounds, options = (256, _RESIDENT_BLOCKS[dtype][0]), _options(dtype, group)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=options, launch_bounds=bounds)
     def begin_flow(state: state_struct):
@@ -114,15 +110,15 @@ def _begin_kernel(dtype, group: int, responding: bool, blocks: int):
 
 
 @cache
-def _sweep_kernel(dtype, group: int, responding: bool):
+def _sweep_kernel(dtype, group: int):
     call = "sweep_moment(state, thread / warpmag::GROUP, last == 1)"
-    arguments, constants = {"last": int, "state": state_type(dtype)}, _constants(group, responding)
+    arguments, constants = {"last": int, "state": state_type(dtype)}, _constants(group)
     launch = {"launch_bounds": (256, _RESIDENT_BLOCKS[dtype][1])}
     return native_kernel(call, "induction/theta_flow.h", arguments, dtype=dtype, launch=launch, **constants)
 
 
 @cache
-def _convergence_kernel(dtype, group: int, responding: bool):
+def _convergence_kernel(dtype, group: int):
     """Return the kernel that sums chunks of worlds; the last block of a world chooses its next step."""
     state_struct = state_type(dtype)
     columns = wp.types.vector(COLUMNS, wp.float64)
@@ -134,7 +130,7 @@ def _convergence_kernel(dtype, group: int, responding: bool):
     @wp.func_native("warpmag::choose_step(state, w, &sums[0]);")
     def choose_step(state: state_struct, w: int, sums: columns): ...
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=_options(dtype, group, responding))
+    @wp.kernel(module="unique", enable_backward=False, module_options=_options(dtype, group))
     def check_convergence(state: state_struct):
         c, lane = wp.tid()
         chunk = state.chunk[c]
@@ -154,9 +150,9 @@ def _convergence_kernel(dtype, group: int, responding: bool):
 
 
 @cache
-def _advance_kernel(dtype, group: int, responding: bool):
+def _advance_kernel(dtype, group: int):
     call, arguments = "advance_moment(state, thread)", {"state": state_type(dtype)}
-    return native_kernel(call, "induction/theta_flow.h", arguments, dtype=dtype, **_constants(group, responding))
+    return native_kernel(call, "induction/theta_flow.h", arguments, dtype=dtype, **_constants(group))
 
 
 @cache
@@ -184,17 +180,17 @@ def launch_set_state(state, magnetizations):
 class Launches:
     """Recorded launches of the flow on one state, which saves packing its arrays each time."""
 
-    def __init__(self, state, bodies: BodyResponses | None):
-        """Record the launches for a state bound to its moments (``solve_state.bind``); ``bodies`` may be None."""
+    def __init__(self, state):
+        """Record the launches for a state bound to its moments (``solve_state.bind``)."""
         device, dtype, count, chunks = state.h.device, state.packed.dtype, state.row.shape[0], state.chunk.shape[0]
-        group, responding = group_threads(device), bodies is not None
+        group = group_threads(device)
 
         def record(kernel, dim, *inputs, block_dim=256, max_blocks=0):
             options = dict(block_dim=block_dim, max_blocks=max_blocks, device=device, record_cmd=True)
             return wp.launch(kernel, dim=dim, inputs=[*inputs, state], **options)
 
         def passes(first: int, last: int):
-            kernel, threads = _passes_kernel(dtype, responding), threads_for(count, MOMENTS_PER_THREAD)
+            kernel, threads = _passes_kernel(dtype), threads_for(count, MOMENTS_PER_THREAD)
             return launch_passes(kernel, first, last + 1, state, device=device, threads=threads, record_cmd=True)
 
         if device.is_cpu:
@@ -203,16 +199,12 @@ class Launches:
         else:
             largest = largest_chunk(state)
             blocks, block_dim = -(-group * largest // _START_THREADS), max(32, largest)
-            width, begin = group * largest // blocks, _begin_kernel(dtype, group, responding, blocks)
+            width, begin = group * largest // blocks, _begin_kernel(dtype, group, blocks)
             self.begin = [record(begin, (blocks * chunks, width), block_dim=width)]
             most = most_blocks(device) if state.active else 0
-            sweep = _sweep_kernel(dtype, group, responding)
+            sweep = _sweep_kernel(dtype, group)
             self.sweeps = [record(sweep, group * count, last, max_blocks=most) for last in (0, 1)]
             self.iteration = [
-                record(_convergence_kernel(dtype, group, responding), (chunks, block_dim), block_dim=block_dim),
-                record(_advance_kernel(dtype, group, responding), count, max_blocks=most),
+                record(_convergence_kernel(dtype, group), (chunks, block_dim), block_dim=block_dim),
+                record(_advance_kernel(dtype, group), count, max_blocks=most),
             ]
-        if bodies is not None:
-            self.begin.append(bodies.begin)
-            self.iteration.insert(0, bodies.respond)
-            self.sweeps = self.sweeps if bodies.cell_count < count else []

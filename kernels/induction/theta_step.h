@@ -114,8 +114,6 @@ template <class State> CUDA_CALLABLE inline void choose_step(State& state, int w
     }
     int next = done || world.plain_steps > 0 ? STEP : STEP_AND_SWEEP;
     if (!mixed) next = STEP_FROM_BEST;
-    // No bound is known for the coupling of bodies with a collective response.
-    if (!mixed && RESPONDING) world.damping *= 0.5;
     if (done && !finite) next = NOTHING;
     if (no_field && !done) next = DEMAGNETIZE;
     world.next = next;

@@ -18,7 +18,6 @@ import numpy as np
 from warpmag.declarations.checks import check_positive
 from warpmag.errors import InputError
 from warpmag.kernels.induction import submagnetization, theta_flow
-from warpmag.kernels.induction.body_response import BodyResponses
 
 STEP = 0.3
 """Default step κ = βΔtMs [dimensionless] of the explicit dynamics: the largest tested step that converges in weak and
@@ -30,17 +29,17 @@ DAMPING = 0.2
 class ThetaFlow:
     """Exact flow of the θ dynamics (Kim and Han 2022, Eqs. 8, 9), accelerated, with an automatic step."""
 
-    def __init__(self, state, responses: BodyResponses | None = None):
-        """Act on the moments of ``state``; ``responses`` are the bodies with a collective response."""
-        self._state, self._responses = state, responses
+    def __init__(self, state):
+        """Act on the moments of ``state``."""
+        self._state = state
 
     def persistent_arrays(self) -> dict:
         """Return by name the arrays of the dynamics that a solve leaves for the next one."""
-        return {} if self._responses is None else self._responses.persistent_arrays()
+        return {}
 
     @cached_property
     def _launches(self) -> theta_flow.Launches:
-        return theta_flow.Launches(self._state, self._responses)
+        return theta_flow.Launches(self._state)
 
     def start_from(self, magnetizations):
         """Start the next solve from magnetizations [A/m], a Warp array of vectors, shape [n]."""
@@ -100,18 +99,18 @@ class SubmagnetizationPairs:
         submagnetization.launch_iteration(self._state, self._pairs)
 
 
-def make_dynamics(name: str, state, *, responses=None, step: float | None = None, damping: float | None = None):
+def make_dynamics(name: str, state, *, step: float | None = None, damping: float | None = None):
     """Return the dynamics ``theta``, ``theta-euler``, ``llg`` or ``llg-damping`` of the moments of ``state``.
 
-    Only ``theta`` uses ``responses``, bodies with a collective response. A ``step`` or a ``damping`` of None means
-    :data:`STEP` or :data:`DAMPING`; one that the dynamics does not have raises ``InputError``.
+    A ``step`` or a ``damping`` of None means :data:`STEP` or :data:`DAMPING`; one that the dynamics does not have
+    raises ``InputError``.
     """
     if step is not None and name == "theta":
         raise InputError("step: the dynamics 'theta' has an automatic step")
     if damping is not None and name != "llg":
         raise InputError(f"damping: the dynamics {name!r} has no damping")
     if name == "theta":
-        return ThetaFlow(state, responses)
+        return ThetaFlow(state)
     step, damping = STEP if step is None else step, DAMPING if damping is None else damping
     check_positive("step", step)
     check_positive("damping", damping)

@@ -36,6 +36,11 @@ class MomentLayout:
         """True for the aligned moments of positive radius, shape [n]."""
         return self.aligned & (self.radii > 0.0)
 
+    @property
+    def single_balls(self) -> np.ndarray:
+        """True for moments of positive radius that are alone in their body and no cell, shape [n]."""
+        return self.single & ~self.cells & (self.radii > 0.0)
+
     def ranges(self) -> list[tuple[int, int, int]]:
         """Return (first moment, first permanent moment, end) of each world."""
         edges = self._edges()

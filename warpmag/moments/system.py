@@ -18,7 +18,6 @@ from warpmag.kernels.cells.couplings import CellCouplings
 from warpmag.kernels.eddy.eddy import EddyCurrents
 from warpmag.kernels.fmm.evaluation import sampled_error
 from warpmag.kernels.induction import solve_state
-from warpmag.kernels.induction.body_response import MOST_CELLS, BodyResponses, RespondingBody
 from warpmag.kernels.induction.energy import launch_energy
 from warpmag.kernels.induction.solve_state import launch_add_bias, launch_start_cold
 from warpmag.kernels.material.curves import LINEAR
@@ -104,8 +103,7 @@ class MomentSystem:
         error: Relative error of each world's magnetization, estimated by ``theta`` (see ``kernels.induction``); other
             dynamics give the residual; shape [worlds].
         residual: Relative residual ‖M − f(H)‖/‖f(H)‖ of each world at its last field evaluation, the computable form of
-            Eq. 12, shape [worlds]; ``theta`` takes one more step after it. For bodies with a collective response (see
-            ``kernels.induction.body_response``) H is the field of that response.
+            Eq. 12, shape [worlds]; ``theta`` takes one more step after it.
         evaluations: Field evaluations of the last solve, shape [worlds].
         converged: 1 where the last solve reached ``rtol``, shape [worlds].
     """
@@ -136,27 +134,25 @@ class MomentSystem:
         layout = with_cells(make_layout(radii, worlds, permanent, bodies, movable, self.dtype), couplings)
         self.eddy, self._ranks, self._graph, self._permanent_fields = None, current_ranks(), None, None
         self.refresh: Callable[[], None] | None = None
-        near, theta = settings.contact_model == "multipole", settings.dynamics == "theta"
+        near = settings.contact_model == "multipole"
         self._allocate(layout, external_field)
         material = material or MomentMaterial()
         self.material, susceptibility = material.parameters(layout, self.dtype, self.device)
         layout = self._make_bias(layout)
         self._make_sources(layout, sources, solids)
         rotatable = ~layout.aligned | settings.single_torque
+        self._rotatable = wp.array(rotatable.astype(np.int32), dtype=wp.int32, device=self.device)
         self._fast = fast_sums_for(settings.method, self._packed, layout, body_extent, float(settings.rtol))
         self.is_fast, self.fmm_rtol = isinstance(self._fast, SystemSums), self._fast.rtol
         self._make_field(layout, near)
-        self._make_cells(layout, couplings, {solid.first for solid in solids}, responses=theta)
+        self._make_cells(layout, couplings, {solid.first for solid in solids})
         if self._cells is not None and solids:
-            self._include_cells(couplings, {solid.first for solid in solids}, susceptibility)
+            self._include_cells(couplings, {solid.first for solid in solids})
         self._make_wrench(layout, rotatable)
         self._near = self._make_near_contacts(layout, rotatable, susceptibility, faces) if near else None
         limits = float(settings.rtol), int(settings.max_evaluations)
         solve_state.bind(self._induction, self._packed, self.material, self.moments, *limits)
-        responses = self._make_responses(layout, couplings) if theta else None
-        self.dynamics = make_dynamics(
-            settings.dynamics, self._induction, responses=responses, step=settings.step, damping=settings.damping
-        )
+        self.dynamics = make_dynamics(settings.dynamics, self._induction, step=settings.step, damping=settings.damping)
 
     def _allocate(self, layout: MomentLayout, external_field):
         n, vec3 = len(layout.radii), vec3_type(self.dtype)
@@ -213,55 +209,41 @@ class MomentSystem:
         more = {"extra_parts": int(near), "sums": self._inducible_sums, "ranks": self._ranks}
         self._inducible_field = PairEvaluation(Quantity.FIELD, of_inducible, packed, packed, state.h0, self.h, **more)
 
-    def _make_cells(self, layout: MomentLayout, couplings, closed_forms: set[int], responses: bool):
+    def _make_cells(self, layout: MomentLayout, couplings, closed_forms: set[int]):
         """Prepare the corrections between cells.
 
         ``closed_forms`` are the first moments of bodies whose near field has a closed form, in place of corrections.
-        ``responses`` is True if small bodies respond collectively.
         """
         self._cells = self._cell_pairs = self.rotations = self.crowded = None
         self._couplings = couplings
         if couplings:
-            collective = [responses and len(coupling.radii) <= MOST_CELLS for _, coupling in couplings]
+            self._induction.within_bodies = int(all(coupling.near for _, coupling in couplings))
             takes_part = [coupling.near and first not in closed_forms for first, coupling in couplings]
-            several = np.bincount(layout.worlds[[first for first, _ in couplings]], takes_part).max() > 1
-            if several:
-                # lone bodies are corrected: touching cubes would pull 9 % too much by common fields, 30 % if softened
-                couplings = [
-                    (first, coupling.among_others if part and len(coupling.radii) > MOST_CELLS else coupling)
-                    for (first, coupling), part in zip(couplings, takes_part, strict=True)
-                ]
-            self._cells = CellCouplings(couplings, self.moments, self.h, collective)
+            in_world = np.bincount(layout.worlds[[first for first, _ in couplings]], minlength=layout.worlds.max() + 1)
+            couplings = [(first, coupling.among(in_world[layout.worlds[first]])) for first, coupling in couplings]
+            parts = np.bincount(layout.worlds[[first for first, _ in couplings]], takes_part, len(in_world))
+            paired = bool(parts.max() > 1) or bool(parts[layout.worlds[layout.single_balls]].any())
+            self._cells = CellCouplings(couplings, self.moments, self.h, paired=paired)
             self.rotations = self._cells.rotations
-            if several:
+            if paired:
                 self._cell_pairs = CellPairs(
-                    couplings, takes_part, self.rotations, layout.worlds, layout.movable, self._packed, self.moments,
-                    self.h, self.forces, self.torques,
+                    couplings, takes_part, self._cells, layout, self._rotatable, self._packed, self.h, self.forces,
+                    self.torques,
                 )  # fmt: skip
                 self.crowded = self._cell_pairs.crowded
 
-    def _include_cells(self, couplings, closed_forms: set[int], susceptibility):
+    def _include_cells(self, couplings, closed_forms: set[int]):
         """Let permanent bodies act on the cells near them by averages; ``closed_forms`` as in :meth:`_make_cells`."""
         bodies: list[NearCellBody | None] = [None] * len(couplings)
         for number, (first, coupling) in enumerate(couplings):
             if coupling.near and first not in closed_forms:
                 response = face_response(tuple(coupling.cell_sides), FACE_SPLIT)
-                bodies[number] = NearCellBody(first, coupling, response, float(susceptibility[first]))
+                bodies[number] = NearCellBody(first, coupling, response)
         if any(bodies):
             self.source_interaction.include_cells(bodies, self.rotations, self.forces, self.torques)
 
-    def _make_responses(self, layout: MomentLayout, couplings) -> BodyResponses | None:
-        """Prepare the collective response of bodies of few cells."""
-        bodies = [
-            RespondingBody(first, int(layout.worlds[first]), number, coupling.dense)
-            for number, (first, coupling) in enumerate(couplings)
-            if len(coupling.radii) <= MOST_CELLS
-        ]
-        return BodyResponses(self._induction, bodies, self.rotations) if bodies else None
-
     def _make_wrench(self, layout: MomentLayout, rotatable):
         """Prepare forces on movable moments for each force law, and torques of the moments that ``rotatable`` marks."""
-        self._rotatable = wp.array(rotatable.astype(np.int32), dtype=wp.int32, device=self.device)
         mutual, rotating = layout.runs(layout.movable & ~rotatable), layout.movable & rotatable
         segments = [np.reshape(rows, (-1, 4)) for rows in (mutual, layout.wrench_runs(rotating))]
         all_segments = np.reshape(mutual + layout.runs(rotating), (-1, 4))
@@ -439,9 +421,9 @@ class MomentSystem:
         """Launch one field evaluation at the inducible moments and one step of the dynamics."""
         self.dynamics.refine()
         self._sum_field()
-        if self._cells is not None:
-            self._cells.launch_others()
         self._add_cell_pairs()
+        if self._cells is not None:
+            self._cells.launch()
         self.dynamics.iterate()
         self._wait_for_near_contacts()
 
@@ -459,9 +441,9 @@ class MomentSystem:
     def evaluate(self):
         """Launch one evaluation of ``h`` at the inducible moments, without a step."""
         self._sum_field()
+        self._add_cell_pairs()
         if self._cells is not None:
             self._cells.launch()
-        self._add_cell_pairs()
         self._wait_for_near_contacts()
 
     def evaluate_again(self):
@@ -492,7 +474,7 @@ class MomentSystem:
     def parts(self) -> dict[str, tuple[Callable[[], None], int]]:
         """Return launches that repeat parts of the last solve and its forces, and their numbers in it, by name.
 
-        They leave all results but ``h``, which becomes the field without collective responses. Waits for the device.
+        They leave all results but ``h``, which becomes the field of the last moments. Waits for the device.
         """
         launches: dict[str, tuple[Callable[[], None], int]] = {"neighbors": (self._packed.find_overlaps, 1)}
         if self.source_interaction is not None:
@@ -577,6 +559,7 @@ class MomentSystem:
             near_pairs.launch_add_forces(near)
         if interaction is not None:
             effective = self._effective if force == "zeeman" else self._packed.moments
+            interaction.write_image_factors(self.moments, self.radii, self.material)
             interaction.add(effective, self.forces, self.torques, near.arrays.magnets.response if expanded else None)
         if self.eddy is not None:
             self.eddy.finish(self.moments, self.torques)

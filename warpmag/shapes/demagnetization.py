@@ -20,7 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
-from warpmag.declarations.rotations import quaternion_of
+from warpmag.declarations.rotations import quaternion_of, rotate
 from warpmag.shapes.ball_pairs import radial_factors
 from warpmag.shapes.lattice import Lattice, Pieces
 from warpmag.shapes.solids import grid
@@ -50,23 +50,32 @@ _BATCH = 1 << 22
 
 
 @dataclass(frozen=True)
-class Coupling:
-    """Correction of the pair sums between the moments of one body, in its frame: H_i += Σ T_ij m_j.
+class Slopes:
+    """Neighbors of a body's linear cells (``linear_cells.py``), and the correction of the pair sums between them.
 
-    The common fields E of all moments (``uniform_response.py``) add H_i += E_i C Σ_j E_jᵀ m_j.
+    Everything is in the frame of the grid. Sides are −x, +x, −y, +y, −z, +z.
     """
+
+    neighbor: np.ndarray  # neighbor of each cell on each side, the cell itself where there is none, shape [n, 6]
+    weight: np.ndarray  # weights w of the neighbors, shape [n, 6]
+    tensor: np.ndarray  # T_ij [1/m³] for the entries of the coupling, H_i += Σ T_ij m_j, shape [entries, 3, 3]
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """Correction of the pair sums between the moments of one body, in its frame: H_i += Σ T_ij m_j + C Σ m_j."""
 
     start: np.ndarray  # first entry of each moment, and the end, shape [n + 1]
     other: np.ndarray  # moment j of each entry, ascending, shape [entries]
     tensor: np.ndarray  # T_ij [1/m³], xx, yy, zz, xy, xz, yz, shape [entries, 6]
-    tensor_among_others: np.ndarray  # T_ij if the world has another body of cells, shape [entries, 6]
-    common: np.ndarray  # matrix C [1/m³], shape [8, 8]
+    common: np.ndarray  # C [1/m³] (``uniform_response.py``), shape [3, 3]
     positions: np.ndarray  # positions of the moments [m], shape [n, 3]
     radii: np.ndarray  # radii of the moments' balls [m], shape [n]
     half_sides: np.ndarray  # boxes with the volumes and second moments of the cells, frame of the grid [m], [n, 3]
     outer_faces: np.ndarray  # True for the faces −x, +x, −y, ... of whole cells on the body's surface, shape [n, 6]
     cell_sides: np.ndarray  # sides of a whole cell [m], frame of the grid, shape [3]
     grid_rotation: np.ndarray  # from the frame of the grid to that of the body (x, y, z, w), shape [4]
+    slopes: Slopes | None  # of linear cells
 
     near = True
     """True if the moments are cells, whose fields nearby are not those of balls."""
@@ -81,27 +90,44 @@ class Coupling:
         """Largest distance of a moment from the center [m], or the radius of a single moment."""
         return float(np.linalg.norm(self.positions - self.center, axis=1).max()) or float(self.radii.max())
 
-    @property
-    def scaled_positions(self) -> np.ndarray:
-        """Positions relative to the center, over the extent, shape [n, 3]."""
-        return (self.positions - self.center) / self.extent
+    def among(self, bodies: int) -> "Coupling":
+        """Return the coupling in a world with a number of bodies of cells, itself included; one for all of a shape.
 
-    @cached_property
-    def among_others(self) -> "Coupling":
-        """The coupling in a world with another body of cells, without common fields; shared by bodies of the shape."""
-        return replace(self, tensor=self.tensor_among_others, common=np.zeros_like(self.common))
-
-    @cached_property
-    def dense(self) -> np.ndarray:
-        """Tensors between all moments [1/m³]: corrected, then uncorrected, shape [2, n, n, 6].
-
-        Valid for uniform common fields only: with linear fields the tensors are not symmetric.
+        C replaces charges near edges. Where bodies touch there are none, so each gets C over the number of bodies. With
+        all of C the operator of a ring, whose flux is closed, would not be positive.
         """
-        n, law = len(self.radii), pair_law_tensors(self.positions, self.radii)
-        corrected = law.copy()
-        corrected[np.repeat(np.arange(n), np.diff(self.start)), self.other] += self.tensor
-        corrected += self.common[COMPONENTS]
-        return np.stack([corrected, law])
+        return self if bodies == 1 else self._among.setdefault(bodies, replace(self, common=self.common / bodies))
+
+    @cached_property
+    def _among(self) -> dict[int, "Coupling"]:
+        return {}
+
+    @property
+    def grid_tensor(self) -> np.ndarray:
+        """Tensors of the entries in the frame of the grid, of linear cells if the body has them, [entries, 3, 3]."""
+        if self.slopes is not None:
+            return self.slopes.tensor
+        return full_tensors(rotated(self.tensor, rotate(self.grid_rotation[None], np.eye(3))))
+
+    @property
+    def grid_common(self) -> np.ndarray:
+        """C in the frame of the grid, shape [3, 3]."""
+        turn = rotate(self.grid_rotation[None], np.eye(3))
+        return turn @ self.common @ turn.T
+
+    @property
+    def neighbor(self) -> np.ndarray:
+        """Neighbor of each cell on the sides −x, +x, −y, ... of the grid, or the cell itself, shape [n, 6]."""
+        own = np.arange(len(self.radii))
+        return np.repeat(own[:, None], 6, axis=1) if self.slopes is None else self.slopes.neighbor
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Weights of each moment and of its neighbors in its differences, 0 for uniform cells, shape [n, 12]."""
+        if self.slopes is None:
+            return np.zeros((len(self.radii), 12))
+        ratio = (self.radii[:, None] / self.radii[self.neighbor]) ** 3
+        return np.concatenate([self.slopes.weight, self.slopes.weight * ratio], axis=1)
 
 
 def pair_law_tensors(positions: np.ndarray, radii: np.ndarray) -> np.ndarray:
@@ -184,8 +210,8 @@ def coupling(lattice: Lattice, radii: np.ndarray) -> Coupling:
     start = np.searchsorted(i[order], np.arange(len(volumes) + 1))
     (part,) = lattice.pieces  # the shapes of an inducible body share a grid
     return Coupling(
-        start, j[order], tensor[order], tensor[order], np.zeros((8, 8)), x, radii, _boxes(part, lattice.volumes),
-        _outer_faces(part, len(volumes)), part.sides, quaternion_of(part.rotation),
+        start, j[order], tensor[order], np.zeros((3, 3)), x, radii, _boxes(part, lattice.volumes),
+        _outer_faces(part, len(volumes)), part.sides, quaternion_of(part.rotation), None,
     )  # fmt: skip
 
 
@@ -398,18 +424,6 @@ def _coarsened(filled: np.ndarray, most: int) -> np.ndarray:
             shape = (*filled.shape[:axis], most, size // most, *filled.shape[axis + 1 :])
             filled = filled.reshape(shape).mean(axis=axis + 1)
     return filled
-
-
-def common_fields(points: np.ndarray) -> np.ndarray:
-    """Return the gradients of ``uniform_response.common_potentials`` at scaled positions, shape [n, 3, 8]."""
-    x, y, z = points.T
-    zero, unit = np.zeros_like(x), np.ones_like(x)
-    rows = (
-        (unit, zero, zero, x, zero, y, z, zero),
-        (zero, unit, zero, zero, y, x, zero, z),
-        (zero, zero, unit, -z, -z, zero, x, y),
-    )
-    return np.moveaxis(np.array(rows), 2, 0)
 
 
 def full_tensors(six: np.ndarray) -> np.ndarray:

@@ -22,13 +22,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warpmag.shapes.demagnetization import Coupling, common_fields, pair_law_tensors
+from warpmag.shapes.demagnetization import Coupling, full_tensors, pair_law_tensors
 from warpmag.shapes.uniform_response import cell_matrix
 
 DISTANT_REACH = 3.0
 """Smallest distance of sources from the body's box, in halves of its longest side."""
 MOST_POINTS = 27
 """Largest number of moments: 3 × 3 × 3 in a cube, 5 × 5 in a plate."""
+LEAST_REPLACED_CELLS = 65
+"""Smallest number of cells of a body that few moments replace."""
 MOST_REPLACED_CELLS = 1000
 """Largest number of cells of bodies that get few moments. More would need a larger matrix than 72 MB."""
 _DEGREE = 4
@@ -36,22 +38,20 @@ _LEAST_GRADIENT = 0.01
 """Least singular value of E over that of the cells: polynomials that vary less over the points get no response."""
 _OTHER_RESPONSE = 1.0
 """Response ε to other fields: that of a sheet across itself."""
-_FULL = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
-"""Components xx, yy, zz, xy, xz, yz of a symmetric tensor in a matrix."""
 
 
 @dataclass(frozen=True)
 class DistantCoupling(Coupling):
-    """Tensors between few moments that replace a body; they have no near field."""
+    """Coupling of few moments that replace a body; they have no near field."""
 
-    tensors: np.ndarray  # full ones and those of the pair law [1/m³], rows xx, xy, xz, yx, ..., shape [2, k, k, 9]
+    differences: np.ndarray  # tensors of all pairs less those of the pair law [1/m³], shape [k², 3, 3]
 
     near = False
 
     @property
-    def dense(self) -> np.ndarray:
-        """Tensors between all moments, as :attr:`Coupling.dense`."""
-        return self.tensors
+    def grid_tensor(self) -> np.ndarray:
+        """Tensors of the entries, as :attr:`Coupling.grid_tensor`."""
+        return self.differences
 
 
 @dataclass(frozen=True)
@@ -156,9 +156,8 @@ def _parts(positions: np.ndarray) -> np.ndarray:
 
 def _solve(body, coupling: Coupling, fields: np.ndarray) -> np.ndarray:
     """Return the magnetizations of ideally permeable cells in fields, both times √V, shape [3 n, fields]."""
-    root = np.repeat(np.sqrt(body.volumes), 3)[:, None]
-    common = root * common_fields(coupling.scaled_positions).reshape(len(root), -1)
-    return np.linalg.solve(cell_matrix(coupling, body) - common @ coupling.common @ common.T, fields)
+    uniform = (np.sqrt(body.volumes)[:, None, None] * np.eye(3)).reshape(-1, 3)
+    return np.linalg.solve(cell_matrix(coupling, body) - uniform @ coupling.common @ uniform.T, fields)
 
 
 def _box(body) -> tuple[np.ndarray, np.ndarray]:
@@ -171,10 +170,11 @@ def _coupling(points: np.ndarray, volumes: np.ndarray, hardness: np.ndarray) -> 
     """Return the coupling of moments at points with the inverse response ``hardness`` [1/m³], shape [3 k, 3 k]."""
     k, radii = len(points), np.cbrt(0.75 * volumes / np.pi)
     full = np.diag(np.repeat(1.0 / (3.0 * volumes), 3)) - hardness
-    law = pair_law_tensors(points, radii)[:, :, _FULL].reshape(k, k, 9)
-    tensors = np.stack([full.reshape(k, 3, k, 3).transpose(0, 2, 1, 3).reshape(k, k, 9), law])
-    nothing, sides = np.zeros((0, 6)), np.repeat(np.cbrt(volumes)[:, None], 3, axis=1)
+    law = full_tensors(pair_law_tensors(points, radii).reshape(-1, 6)).reshape(k, k, 3, 3)
+    differences = full.reshape(k, 3, k, 3).transpose(0, 2, 1, 3) - law
+    sides = np.repeat(np.cbrt(volumes)[:, None], 3, axis=1)
     return DistantCoupling(
-        np.zeros(k + 1, int), np.zeros(0, int), nothing, nothing, np.zeros((8, 8)), points, radii, 0.5 * sides,
-        np.zeros((k, 6), bool), sides.max(axis=0), np.array([0.0, 0.0, 0.0, 1.0]), tensors,
+        k * np.arange(k + 1), np.tile(np.arange(k), k), np.zeros((k * k, 6)), np.zeros((3, 3)), points, radii,
+        0.5 * sides, np.zeros((k, 6), bool), sides.max(axis=0), np.array([0.0, 0.0, 0.0, 1.0]), None,
+        differences.reshape(-1, 3, 3),
     )  # fmt: skip

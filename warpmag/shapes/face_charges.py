@@ -4,10 +4,11 @@ Cells are uniformly magnetized, and so are the charges of their faces. In front 
 iron face varies over less than a cell. Without that a magnet in contact pulls 15 to 30 % too little.
 
 A face gets charges q on equal squares besides. Those of an ideally permeable body keep its surface at one potential:
-S q + φ = const with the potentials S of uniformly charged squares. As uniform and linear charges are left to the
-magnetization of the cells, q = −R φ with R = Q (Qᵀ S Q)⁻¹ Qᵀ, where the columns of Q span all other charges. The energy
-is −½ μ0 φᵀ R φ. A body of finite susceptibility χ responds by χ/(χ + 2) of that, as a half-space does. Charges of
-different faces do not act on each other: they fall off fast.
+S q + φ = const with the potentials S of uniformly charged squares. The magnetization of the cells has uniform charges,
+and keeps the average field of each cell near 0. So φ is the potential less that of the average field, and q = −R φ with
+R = Q (Qᵀ S Q)⁻¹ Qᵀ, where the columns of Q span all charges without a sum. The energy is −½ μ0 φᵀ R φ. A body of finite
+susceptibility χ responds by χ/(χ + 2) of that, as a half-space does. Charges of different faces do not act on each
+other: they fall off fast.
 """
 
 from functools import cache
@@ -48,6 +49,5 @@ def _rectangle_response(sides: np.ndarray, split: int) -> np.ndarray:
     at_points = potentials(points, squares).reshape(split**2, len(inner), -1) / step.prod()
     self_potential = np.einsum("ipj,p->ij", at_points, 0.25 * np.outer(weights, weights).ravel())
     self_potential = 0.5 * (self_potential + self_potential.T)
-    of_cells = np.column_stack([np.ones(len(unit)), unit])
-    other = np.linalg.svd(of_cells)[0][:, of_cells.shape[1] :]
+    other = np.linalg.svd(np.ones((len(unit), 1)))[0][:, 1:]
     return other @ np.linalg.solve(other.T @ self_potential @ other, other.T)

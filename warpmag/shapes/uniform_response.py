@@ -1,20 +1,15 @@
-"""Response of a body to uniform and linear fields, from a surface integral, and the correction of its cells.
+"""Response of a body to uniform fields, from a surface integral, and the correction of its cells.
 
-Cells of uniform magnetization (``demagnetization.py``) take too small a moment. The moment is up to a third too small
-with one or two cells across a sheet or across the strokes of a letter. The response of an ideally permeable body
-follows from its surface alone, which is at one potential: (1/4π) ∫ σ/‖x − y‖ dA = ψ. In a uniform field H0, ψ = H0·x,
-and the moment is ∫ σ x dA. The charge σ is taken as constant on facets (``facets.py``). The potential of a facet is a
-closed form (Wilton et al., IEEE Trans. Antennas Propag. 32 (1984) 276). The response of the cells is solved
-directly, or by conjugate gradients if there are many.
+Cells (``demagnetization.py``, ``linear_cells.py``) take too small a moment: up to a third with one or two uniform cells
+across the strokes of a letter, 1 to 4 % with linear ones. The response of an ideally permeable body follows from its
+surface alone, which is at one potential: (1/4π) ∫ σ/‖x − y‖ dA = ψ. In a uniform field H0, ψ = H0·x, and the moment is
+∫ σ x dA. The charge σ is taken as constant on facets (``facets.py``). The potential of a facet is a closed form (Wilton
+et al., IEEE Trans. Antennas Propag. 32 (1984) 276). The response of the cells is solved directly, or by conjugate
+gradients if there are many.
 
-Let P be the polarizability of the cells, Q the polarizability of the surface, and N the operator of the cells. The
-correction replaces N by N − E C Eᵀ, where C = P⁻¹ − Q⁻¹ and the columns of E are uniform fields. It adds a field of C
+Let P be the polarizability of the cells and Q that of the surface. The correction adds a uniform field of C = P⁻¹ − Q⁻¹
 times the moment of the body to all cells. By Woodbury's formula the response to a uniform field becomes Q. Because Q is
 positive, the operator stays positive. A change of the cells' own tensors would not ensure that.
-
-The same holds for more fields. The columns of E are gradients of harmonic polynomials ψ_k, and P and Q are matrices,
-Q_kl = ∫ σ_k ψ_l dA. Three uniform and five linear fields are used. A nearby magnet excites mostly these: without
-the linear fields, the force on a plate below a magnet is 2 to 4 % too small.
 """
 
 from collections.abc import Sequence
@@ -22,26 +17,21 @@ from dataclasses import replace
 
 import numpy as np
 
+from warpmag.declarations.rotations import rotate
 from warpmag.shapes import facets
 from warpmag.shapes.ball_pairs import radial_factors
-from warpmag.shapes.demagnetization import COMPONENTS, Coupling, common_fields, full_tensors
+from warpmag.shapes.demagnetization import COMPONENTS, Coupling
 from warpmag.shapes.lattice import Lattice
 from warpmag.shapes.solids import Solid
 
-FIELD_COUNT = 8
-"""Largest number of fields that the cells of a body have in common: three uniform and five linear fields."""
-LINEAR_FIELD_CELLS = 65, 2500
-"""Smallest and largest number of cells of bodies that get the linear fields, too. Bodies of fewer cells may respond
-collectively (``kernels.induction.body_response``), which needs symmetric tensors; with linear fields they are not
-symmetric. Bodies of more cells need little correction, and its time is proportional to their number."""
 FACETS = 600
 """Approximate number of facets of a body. Extrapolation from it and a quarter of it gives a cube's moment to 0.3 %."""
 _FACETS_PER_SHAPE = 150
 """Smallest number of facets per shape: a quarter of it is the smallest number that ``facets.py`` makes."""
 MOST_FACETS = 1500
 """Largest number of facets. Bodies of more facets, such as meshes of many triangles, are not corrected."""
-MOST_MOMENTS = 6200
-"""Largest number of moments of a corrected body: arrays over its pairs take 0.6 GB."""
+MOST_MOMENTS = 3000
+"""Largest number of moments of a corrected body: arrays over its pairs take 0.15 GB."""
 _POLARIZABILITY_RATIOS = 0.9, 4.0
 """Smallest and largest plausible ratio of the polarizabilities of surface and cells. Ratios outside come from
 nearly touching surfaces, which facets do not resolve."""
@@ -62,7 +52,7 @@ _CHUNK = 1 << 18
 
 
 def with_surface_response(coupling: Coupling, lattice: Lattice, solids: Sequence[Solid]) -> Coupling:
-    """Return the coupling with a matrix of the common fields that gives the body the response of its surface.
+    """Return the coupling with a common field that gives the body the response of its surface.
 
     The coupling is returned unchanged if the body has separate parts, or too many facets or cells, or if facets of
     different shapes coincide.
@@ -73,54 +63,37 @@ def with_surface_response(coupling: Coupling, lattice: Lattice, solids: Sequence
     coarse, fine = (facets.of_body(solids, count) for count in (most // 4, most))
     if not len(coarse) or len(fine) > MOST_FACETS:
         return coupling
-    surface_matrix = extrapolated_polarizability(coupling, coarse, fine)
-    cell_matrix = cell_polarizability(coupling, lattice)
-    for count in range(len(cell_matrix), 0, -FIELD_COUNT + 3):  # all fields, else the uniform fields
-        cells, surface = cell_matrix[:count, :count], surface_matrix[:count, :count]
-        ratios = np.linalg.eigvals(np.linalg.solve(surface, cells)).real
-        if ratios.min() > 1.0 / _POLARIZABILITY_RATIOS[1] and ratios.max() < 1.0 / _POLARIZABILITY_RATIOS[0]:
-            common = np.zeros((FIELD_COUNT, FIELD_COUNT))
-            common[:count, :count] = np.linalg.inv(cells) - np.linalg.inv(surface)
-            return replace(coupling, common=common)
+    surface = extrapolated_polarizability(coarse, fine)
+    cells = cell_polarizability(coupling, lattice)
+    ratios = np.linalg.eigvals(np.linalg.solve(surface, cells)).real
+    if ratios.min() > 1.0 / _POLARIZABILITY_RATIOS[1] and ratios.max() < 1.0 / _POLARIZABILITY_RATIOS[0]:
+        return replace(coupling, common=np.linalg.inv(cells) - np.linalg.inv(surface))
     return coupling
 
 
-def common_potentials(points: np.ndarray) -> np.ndarray:
-    """Return x, y, z, (x² − z²)/2, (y² − z²)/2, xy, xz, yz at points, shape [n, 8]; ``common_fields`` are gradients."""
-    x, y, z = points.T
-    return np.stack([x, y, z, 0.5 * (x * x - z * z), 0.5 * (y * y - z * z), x * y, x * z, y * z], axis=1)
-
-
-def extrapolated_polarizability(coupling: Coupling, coarse: np.ndarray, fine: np.ndarray) -> np.ndarray:
+def extrapolated_polarizability(coarse: np.ndarray, fine: np.ndarray) -> np.ndarray:
     """Return :func:`surface_polarizability`, extrapolated; its error is inversely proportional to the facet count."""
-    result = surface_polarizability(coupling, fine)
+    result = surface_polarizability(fine)
     if len(fine) < 2 * len(coarse):
         return result
-    return result + (result - surface_polarizability(coupling, coarse)) / (len(fine) / len(coarse) - 1.0)
+    return result + (result - surface_polarizability(coarse)) / (len(fine) / len(coarse) - 1.0)
 
 
-def surface_polarizability(coupling: Coupling, surface: np.ndarray) -> np.ndarray:
-    """Return the polarizability matrix Q_kl [m³] of an ideally permeable body for its common fields, shape [k, k].
+def surface_polarizability(surface: np.ndarray) -> np.ndarray:
+    """Return the polarizability Q [m³] of an ideally permeable body: its moments in uniform fields, shape [3, 3].
 
-    ``surface`` are the facets of the body [m], shape [m, 4, 3]. The entries of the uniform fields are the moments in
-    uniform fields.
+    ``surface`` are the facets of the body [m], shape [m, 4, 3].
     """
     centroids, (_, areas) = facets.centroids(surface), facets.normals_and_areas(surface)
-    count = _field_count(coupling)
-    potential = coupling.extent * common_potentials((centroids - coupling.center) / coupling.extent)[:, :count]
+    potential = centroids - centroids.mean(axis=0)
     matrix = np.zeros((len(potential) + 1, len(potential) + 1))
     step = max(1, _CHUNK // len(potential))
     for start in range(0, len(potential), step):
         matrix[start : min(start + step, len(potential)), :-1] = potentials(centroids[start : start + step], surface)
     matrix[:-1, -1], matrix[-1, :-1] = 1.0, areas  # unknown potential of the body, total charge zero
-    charges = np.linalg.solve(matrix, np.append(potential, np.zeros((1, count)), axis=0))[:-1]
+    charges = np.linalg.solve(matrix, np.append(potential, np.zeros((1, 3)), axis=0))[:-1]
     result = (charges * areas[:, None]).T @ potential
     return 0.5 * (result + result.T)
-
-
-def _field_count(coupling: Coupling) -> int:
-    """Return the number of common fields for the cells of a body."""
-    return FIELD_COUNT if LINEAR_FIELD_CELLS[0] <= len(coupling.radii) <= LINEAR_FIELD_CELLS[1] else 3
 
 
 def potentials(points: np.ndarray, surface: np.ndarray) -> np.ndarray:
@@ -181,13 +154,12 @@ def _near_potentials(points: np.ndarray, surface: np.ndarray, near: np.ndarray) 
 
 
 def cell_polarizability(coupling: Coupling, lattice: Lattice) -> np.ndarray:
-    """Return the polarizability matrix P_kl [m³] of a body's cells for its common fields, shape [k, k].
+    """Return the polarizability P [m³] of a body's cells: their moments in uniform fields, shape [3, 3].
 
     Pairs of cells without an entry in the coupling act on each other as dipoles. Raises ``LinAlgError`` if conjugate
     gradients do not converge.
     """
-    root = np.sqrt(lattice.volumes)[:, None, None]
-    fields = root * common_fields(coupling.scaled_positions)[:, :, : _field_count(coupling)]
+    fields = np.sqrt(lattice.volumes)[:, None, None] * np.eye(3)
     if len(fields) <= _MATRIX_CELLS:
         columns = fields.reshape(3 * len(fields), -1)
         moments = columns.T @ np.linalg.solve(cell_matrix(coupling, lattice), columns)
@@ -222,7 +194,7 @@ def _cell_operator(coupling: Coupling, lattice: Lattice):
     With r = x − y, each term of r(r·m) becomes a sum over y, computed as a product of matrices.
     """
     x, root, isotropic, dipolar, unit = pair_factors(coupling, lattice)
-    n, tensors = len(x), full_tensors(coupling.tensor) * unit**3
+    n, tensors = len(x), _tensors(coupling) * unit**3
 
     def apply(scaled: np.ndarray) -> np.ndarray:
         m = scaled * root[:, None, None]
@@ -243,7 +215,7 @@ def _cell_operator(coupling: Coupling, lattice: Lattice):
 def cell_matrix(coupling: Coupling, lattice: Lattice) -> np.ndarray:
     """Return the operator of :func:`_cell_operator` as a matrix, shape [3 n, 3 n]."""
     x, root, isotropic, dipolar, unit = pair_factors(coupling, lattice)
-    n, tensors = len(x), full_tensors(coupling.tensor) * unit**3
+    n, tensors = len(x), _tensors(coupling) * unit**3
     matrix = np.empty((n, 3, n, 3))
     for k, j in zip(*COMPONENTS, strict=True):
         block = dipolar * (x[:, None, k] - x[:, k]) * (x[:, None, j] - x[:, j]) + (isotropic if k == j else 0.0)
@@ -251,6 +223,12 @@ def cell_matrix(coupling: Coupling, lattice: Lattice) -> np.ndarray:
     matrix[np.repeat(np.arange(n), np.diff(coupling.start)), :, coupling.other] += tensors
     matrix *= -root[:, None, None, None] * root[:, None]
     return matrix.reshape(3 * n, 3 * n)
+
+
+def _tensors(coupling: Coupling) -> np.ndarray:
+    """Return the tensors of the coupling's entries in the frame of the body, shape [entries, 3, 3]."""
+    turn = rotate(coupling.grid_rotation[None], np.eye(3)).T
+    return turn @ coupling.grid_tensor @ turn.T
 
 
 def pair_factors(coupling: Coupling, lattice: Lattice) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:

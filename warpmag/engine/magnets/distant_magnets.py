@@ -13,7 +13,6 @@ from warpmag.engine.magnets.grouping import BodyMagnet
 from warpmag.engine.magnets.model_values import ModelValues
 from warpmag.engine.magnets.placed_moments import PlacedMoments
 from warpmag.engine.magnets.sampling import BodyLattice, shape_cache
-from warpmag.kernels.induction.body_response import MOST_CELLS
 from warpmag.kernels.rigid.distant import (
     DistantBodies,
     DistantLaunches,
@@ -22,7 +21,8 @@ from warpmag.kernels.rigid.distant import (
 )
 from warpmag.moments.ranks import current_ranks
 from warpmag.moments.resting_worlds import RestingWorlds
-from warpmag.shapes.distant_response import MOST_REPLACED_CELLS, DistantBody, distant_body
+from warpmag.shapes.demagnetization import Coupling
+from warpmag.shapes.distant_response import LEAST_REPLACED_CELLS, MOST_REPLACED_CELLS, DistantBody, distant_body
 
 
 def distant_bodies(
@@ -44,29 +44,26 @@ def distant_bodies(
     ):
         return {}
     coupled = {k: magnet.lattice for k, magnet in enumerate(magnets) if magnet.lattice.coupling is not None}
-    large = {k: lattice for k, lattice in coupled.items() if len(lattice.volumes) > MOST_CELLS}
+    large = {k: lattice for k, lattice in coupled.items() if len(lattice.volumes) >= LEAST_REPLACED_CELLS}
     if any(len(lattice.volumes) > MOST_REPLACED_CELLS for lattice in large.values()):
         return {}
     in_world = Counter(magnets[k].world for k in coupled)
-    bodies: dict[tuple, DistantBody | None] = {}
+    bodies: dict[int, DistantBody | None] = {}
     result = {}
     for k, lattice in large.items():
-        key = id(lattice), in_world[magnets[k].world] > 1
-        if key not in bodies:
-            bodies[key] = _distant_body(model.shape_label[magnets[k].shapes[0]], lattice, among_others=key[1])
-        if (body := bodies[key]) is None:
+        coupling = lattice.coupling.among(in_world[magnets[k].world])
+        if id(coupling) not in bodies:
+            bodies[id(coupling)] = _distant_body(model.shape_label[magnets[k].shapes[0]], lattice, coupling)
+        if (body := bodies[id(coupling)]) is None:
             return {}
         result[k] = body
     return result
 
 
-def _distant_body(label: str, lattice: BodyLattice, *, among_others: bool) -> DistantBody | None:
+def _distant_body(label: str, lattice: BodyLattice, coupling: Coupling) -> DistantBody | None:
     """Return the few moments of a body, from the cache of shapes or computed."""
-    coupling = lattice.coupling
-    assert coupling is not None
-    coupling = coupling.among_others if among_others else coupling
     key = ("distant", lattice.positions, lattice.volumes, lattice.radii, coupling.start, coupling.other)
-    key = (*key, coupling.tensor, coupling.common)
+    key = (*key, coupling.grid_tensor, coupling.common)
     return shape_cache().get(f"{label}: few moments", key, lambda: distant_body(lattice, coupling))
 
 

@@ -17,9 +17,9 @@ from warpmag.moments.arrays import RADIUS_RANGE
 from warpmag.shapes import lattice, polyhedra
 from warpmag.shapes.demagnetization import Coupling, coupling
 from warpmag.shapes.flat_faces import FlatFaces, faces_of_mesh, faces_of_polyhedron, joined
+from warpmag.shapes.linear_cells import with_slopes
 from warpmag.shapes.polyhedra import Moments, Polyhedron
 from warpmag.shapes.shape_cache import FOLDER, ShapeCache
-from warpmag.shapes.softening import softened
 from warpmag.shapes.solids import boxes_meet
 from warpmag.shapes.uniform_response import with_surface_response
 
@@ -145,7 +145,9 @@ class ShapeSampler:
             parts.append(ClosedForm(int(end - count), int(count), shape, reach, moments))
         if fixed:
             return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solids=tuple(parts))
-        cells = softened(coupling(filled, filled.radii), filled)
+        cells = coupling(filled, filled.radii)
+        if not permanent:
+            cells = with_slopes(cells, filled)
         with contextlib.suppress(np.linalg.LinAlgError):  # long wires keep the response of their cells
             cells = with_surface_response(cells, filled, solids)
         faces = None if permanent else joined([self._faces(*pair) for pair in zip(shapes, solids, strict=True)])

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpmag.engine.magnets.placed_moments import PlacedMoments
+from warpmag.kernels.applied.near_cells import NEAR
 from warpmag.moments.part_times import part_times
 
 _MOST_LINES = 10
@@ -92,7 +93,7 @@ def near_cells(system) -> np.ndarray:
     interaction = system.source_interaction
     if interaction is not None and interaction.cell_count:
         cells = interaction.arrays.cells
-        near[cells.cell.numpy()[:, 0]] = cells.near.numpy() != 0
+        near[cells.cell.numpy()[:, 0]] = cells.near.numpy() == NEAR
     return near
 
 

@@ -1,0 +1,187 @@
+"""Cells whose magnetization varies along its own axes: differences between their halves, and the operator of a body.
+
+Iron of high permeability has charges on its surface and almost none inside. Uniform cells have charges on the faces
+between them wherever the magnetization varies. They cost energy, and the body responds too little: two letters in
+contact attract each other 20 % too weakly. So a component of the magnetization has a slope along its own axis, from
+the neighbors on both sides. Where div M = 0 the charges in a cell then cancel, and faces have almost none.
+
+The unknowns stay one vector M per cell, the mean. Along axis k the halves of a cell have the means M ± D M, with
+
+    D M = ¼ Σ_s s w_s (M_s − M),    s = ±1,    w_s = ½ min(V_s/V, V/V_s) a a_s,    a = min(1, V_whole/V),
+
+where M_s is the neighbor on the side s; w_s = 0 where there is none. Cells that the surface cuts, or that are several
+pieces, so have smaller slopes than whole cells. Without that, their operator is not positive. The field that magnetizes
+a cell is the derivative of the energy: the mean field, plus Dᵀ of half the difference G of the fields of the halves.
+Halves lack the linear part within a half, whose field is H = −M as in a plate. Its energy per volume, μ0 D²/6, is
+subtracted.
+
+Magnetizations without charges have no energy. In iron they do not occur, because M follows the curl-free field H. But
+conjugate gradients need many steps for them, and errors of distant pairs of cells would make their energy negative. So
+the curl of M at the edges between cells gets a small one, :data:`_CURL` μ0 (a curl M)²/2 per volume, where a is the
+geometric mean of the sides of a cell across the edge.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.sparse import csr_array, eye_array
+
+from warpmag.shapes.demagnetization import Coupling, Slopes, cuboid_tensors, full_tensors, rotated
+from warpmag.shapes.lattice import Lattice, Pieces
+from warpmag.shapes.solids import grid
+
+LEAST_CELLS = 65
+"""Smallest number of linear cells of a body. Smaller bodies get the response of their surface
+(``uniform_response.py``)."""
+_CURL = 0.004
+"""Demagnetizing factor of the curl. It removes 1 % of the force between letters in contact. At a third of it, five
+discs in a stack do not converge."""
+_WITHIN_HALF = 1.0 / 3.0
+"""Demagnetizing factor of the linear part within a half, for the difference D M."""
+
+
+def with_slopes(coupling: Coupling, lattice: Lattice) -> Coupling:
+    """Return the coupling with linear cells. Bodies of fewer than :data:`LEAST_CELLS` are returned unchanged."""
+    if len(coupling.radii) < LEAST_CELLS:
+        return coupling
+    (part,) = lattice.pieces  # the shapes of an inducible body share a grid
+    index = _cell_indices(part)
+    neighbor, weight = _neighbors(index, lattice.volumes / part.sides.prod())
+    operator = _Operator(coupling, part, index, lattice.volumes, neighbor, weight)
+    tensor = np.empty((len(coupling.other), 3, 3))
+    for k in range(3):
+        for j in range(k, 3):
+            tensor[:, k, j], tensor[:, j, k] = operator.entries(k, j)
+    tensor /= np.sqrt(lattice.volumes[operator.row] * lattice.volumes[coupling.other])[:, None, None]
+    return replace(coupling, slopes=Slopes(neighbor, weight, tensor))
+
+
+def _cell_indices(part: Pieces) -> np.ndarray:
+    """Return the grid index of the cell with the largest part of each moment, shape [n, 3]."""
+    order = np.lexsort((part.share * part.filled.mean(axis=(1, 2, 3))[part.piece], part.moment))
+    last = np.append(np.flatnonzero(np.diff(part.moment[order])), len(order) - 1)
+    return part.index[part.piece[order[last]]]
+
+
+def _neighbors(index: np.ndarray, volumes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return neighbors and weights; ``volumes`` are over that of a whole cell.
+
+    Neighbors are mutual, and of two cells at one index the larger one has them.
+    """
+    cells = {}
+    for i in np.argsort(volumes, kind="stable").tolist():
+        cells[tuple(index[i])] = i
+    own = np.arange(len(index))
+    neighbor = np.repeat(own[:, None], 6, axis=1)
+    for side in range(6):
+        step = np.eye(3, dtype=int)[side // 2] * (2 * (side % 2) - 1)
+        for at, i in cells.items():
+            neighbor[i, side] = cells.get(tuple(at + step), i)
+    ratio, whole = volumes[neighbor] / volumes[:, None], np.minimum(1.0, 1.0 / volumes)
+    weight = 0.5 * (neighbor != own[:, None]) * np.minimum(ratio, 1.0 / ratio) * whole[:, None] * whole[neighbor]
+    return neighbor, weight
+
+
+class _Operator:
+    """Operator of a body's linear cells less the pair law, symmetrized by the roots of volumes."""
+
+    def __init__(self, coupling, part: Pieces, index, volumes, neighbor, weight):
+        """Compute the tensors of the coupling's entries in the frame of the grid."""
+        self.row, self.other = np.repeat(np.arange(len(volumes)), np.diff(coupling.start)), coupling.other
+        self._own, self._root, self._neighbor, self._weight = (
+            np.arange(len(volumes)),
+            np.sqrt(volumes),
+            neighbor,
+            weight,
+        )
+        scale = self._root[self.row] * self._root[self.other]
+        own = self.row == self.other
+        self._of_means = full_tensors(rotated(coupling.tensor, part.rotation.T)) * scale[:, None, None]
+        self._of_means[own] -= np.eye(3) / 3.0  # the magnetization curve's share, which is of the cell itself
+        offsets, inverse = np.unique(index[self.row] - index[self.other], axis=0, return_inverse=True)
+        shares = (scale / part.sides.prod())[:, None, None]
+        self._differences = [-block[inverse.reshape(-1)] * shares for block in half_cell_tensors(offsets, part.sides)]
+        self._differences[2][own] += _WITHIN_HALF * np.eye(3)
+        self._slopes = [self._difference(axis) for axis in range(3)]
+        self._curls = [self._curl(axis, part.sides) for axis in range(3)]
+
+    def entries(self, k: int, j: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the operator's entries of the coupling from component j to component k, and back, shape [entries].
+
+        Slopes reach farther than the coupling. What is left out counts for the moment itself, as if the others were
+        magnetized like it, so that uniform magnetizations have neither slopes nor their energy.
+        """
+        block = self.block(k, j)
+        there, back = block[self.row, self.other], block[self.other, self.row]
+        both, root = 0.5 * (block + block.T), self._root
+        listed = np.bincount(self.row, 0.5 * (there + back) * root[self.other], len(root))
+        left_out = (both @ root - listed) / root
+        own = self.row == self.other
+        there[own] += left_out
+        back[own] += left_out
+        return there, back
+
+    def block(self, k: int, j: int) -> csr_array:
+        """Return the operator from component j to component k, shape [n, n]."""
+        n = len(self._own)
+        values = (self._of_means, *self._differences)
+        means, by_differences, at_differences, differences = (
+            csr_array((entries[:, k, j], (self.row, self.other)), shape=(n, n)) for entries in values
+        )
+        of_slope, at_slope = self._slopes[j], self._slopes[k].T
+        block = means + by_differences @ of_slope + at_slope @ (at_differences + differences @ of_slope)
+        for curl in self._curls:
+            if k in curl and j in curl:
+                block -= _CURL * (curl[k].T @ curl[j])
+        return (block + eye_array(n) / 3.0 if k == j else block).tocsr()
+
+    def _difference(self, axis: int) -> csr_array:
+        """Return D of √V M along an axis, shape [n, n]."""
+        n, parts = len(self._own), []
+        for side in (2 * axis, 2 * axis + 1):
+            neighbor, weight = self._neighbor[:, side], (0.5 * (side % 2) - 0.25) * self._weight[:, side]
+            parts.append((-weight, self._own))
+            parts.append((weight * self._root / self._root[neighbor], neighbor))
+        values, columns = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return csr_array((values, (np.tile(self._own, 4), columns)), shape=(n, n))
+
+    def _curl(self, axis: int, sides: np.ndarray) -> dict:
+        """Return the curl along an axis at the edges between four cells, by components of √V M, each [edges, n]."""
+        k, j = (axis + 1) % 3, (axis + 2) % 3
+        beside, above = self._neighbor[:, 2 * k + 1], self._neighbor[:, 2 * j + 1]
+        across = self._neighbor[beside, 2 * j + 1]
+        four = (beside != self._own) & (above != self._own) & (across != beside) & (across != above)
+        edge = np.flatnonzero(four & (self._neighbor[above, 2 * k + 1] == across))
+        cells = np.stack([edge, beside[edge], above[edge], across[edge]])
+        least = self._root[cells].min(axis=0)
+        rows = np.tile(np.arange(len(edge)), 4)
+        shape, ratio, result = (len(edge), len(self._own)), np.sqrt(sides[j] / sides[k]), {}
+        for component, signs, factor in ((j, (-1, 1, -1, 1), ratio), (k, (1, 1, -1, -1), 1.0 / ratio)):
+            values = 0.5 * factor * np.array(signs)[:, None] * least / self._root[cells]
+            result[component] = csr_array((values.ravel(), (rows, cells.ravel())), shape=shape)
+        return result
+
+
+def half_cell_tensors(offsets: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return demagnetizing tensors between the means and differences of cells, three arrays of shape [n, 3, 3].
+
+    They are of means by differences, of differences by means, and of differences by differences. ``offsets`` are the
+    vectors from sources to targets in ``sides``, whole numbers, shape [n, 3].
+    """
+    steps = grid(np.array([3, 3, 3])).astype(int) - 1  # between an octant of the target and one of the source
+    octants = np.asarray(offsets)[:, None] * 2 + steps
+    tensors = full_tensors(cuboid_tensors(octants.reshape(-1, 3), np.asarray(sides) / 2.0)).reshape(-1, 27, 3, 3)
+    both, of_source, of_target, of_both = np.array([[1, 2, 1], [1, 0, -1], [-1, 0, 1], [-1, 2, -1]]) / 2.0
+    results = tuple(np.zeros((len(octants), 3, 3)) for _ in range(3))
+    for k in range(3):
+        for j in range(3):
+            patterns = (
+                [of_source if axis == j else both for axis in range(3)],
+                [of_target if axis == k else both for axis in range(3)],
+                [of_both if axis == j == k else of_source if axis == j else of_target if axis == k else both
+                 for axis in range(3)],
+            )  # fmt: skip
+            for result, pattern in zip(results, patterns, strict=True):
+                weights = np.prod([row[steps[:, axis] + 1] for axis, row in enumerate(pattern)], axis=0)
+                result[:, k, j] = tensors[:, :, k, j] @ weights
+    return results[0], results[1], results[2]
