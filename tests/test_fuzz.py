@@ -90,16 +90,19 @@ def test_a_campaign_survives_its_workers(batch, workers, tmp_path, monkeypatch):
             time.sleep(60.0)
         if number == 11:
             raise ValueError("odd")
-        return Verdict(number, "usda", f"{seed}-{number}", 2, 2, problems=["much"] if number == 13 else [])
+        problems = ["much"] if number == 13 else []
+        seconds = campaign.CPU_SECONDS + 1.0 if number == 17 else 1.0
+        return Verdict(number, "usda", f"{seed}-{number}", 2, 2, problems=problems, seconds=seconds)
 
     monkeypatch.setattr(campaign, "judge", judge_or_die)
     monkeypatch.setattr(campaign, "WALL_SECONDS", 1.0)
     verdicts = {verdict.number: verdict for verdict in Campaign(5, tmp_path, [], batch, workers).verdicts(range(20))}
     assert sorted(verdicts) == list(range(20))
     problems = {number: " ".join(verdict.problems) for number, verdict in verdicts.items() if verdict.problems}
-    assert problems.keys() == {3, 7, 11, 13}
+    assert problems.keys() == {3, 7, 11, 13, 17}
     assert problems[3] == "died of SIGKILL" and problems[7] == "hung for 1.0 s" and "ValueError" in problems[11]
+    assert problems[17] == "took 31 s of CPU time"
     assert {verdict.done for verdict in verdicts.values() if not verdict.problems} == {
-        f"5-{n}" for n in {*range(20)} - {3, 7, 11, 13}
+        f"5-{n}" for n in {*range(20)} - {3, 7, 11, 13, 17}
     }
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["00003", "00007", "00011", "00013"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"{n:05}" for n in (3, 7, 11, 13, 17)]

@@ -30,9 +30,13 @@ from .truth import differences
 
 FORMS = ("usda",) * 13 + ("text",) * 3 + ("crate",) * 3 + ("package",)
 """Formats of mutants, in these proportions: text, damaged text, crate files, packages."""
-CPU_SECONDS, WALL_SECONDS = 150, 600
-"""Time that a stage may take [s], up to 80 of which are for compiling contacts of a new kind of shape; wall time allows
-for a loaded machine."""
+CPU_SECONDS = 30
+"""CPU time that a stage may take [s], for the mutant, ``check``, ``run``, ``render`` of textures, and the comparison of
+results. Compilation of kernels does not count: users pay for it once for a version, not for a stage. Tables of shapes
+count, unless they are in the cache already: begin a campaign without the folder ``warpmag_shapes``."""
+KERNEL_SECONDS, WALL_SECONDS = 80, 600
+"""CPU time beyond it after which a worker is killed [s], which contacts of a new kind of shape take to compile, and the
+wall time after which it is, which allows for a loaded machine."""
 MEMORY = 8 << 30
 """Address space of a worker [bytes]."""
 OK, FAILED, BAD_INPUT = 0, 1, 2
@@ -61,7 +65,7 @@ class Verdict:
         run: Exit code of ``warpmag run``.
         line: The one line by which the run was refused.
         problems: What must not happen.
-        seconds: CPU time with that of child processes [s].
+        seconds: CPU time with that of child processes, without the compilation of kernels in this process [s].
     """
 
     number: int
@@ -98,6 +102,37 @@ class _Reached:
 
 
 _reached = _Reached()
+
+
+class _Kernels:
+    """CPU time that this process takes to compile and load kernels.
+
+    Attributes:
+        seconds: The time so far, from the first :meth:`begin` [s].
+    """
+
+    def __init__(self):
+        self.seconds, self._watched = 0.0, False
+
+    def begin(self) -> None:
+        """Measure loads of kernels from now on. Loads are not nested; each thread has its own time."""
+        if self._watched:
+            return
+        import warp as wp  # noqa: PLC0415 - a worker has it imported
+
+        self._watched, load = True, wp.Module.load
+
+        def timed_load(*arguments, **named):
+            began = time.thread_time()
+            try:
+                return load(*arguments, **named)
+            finally:
+                self.seconds += time.thread_time() - began
+
+        wp.Module.load = timed_load
+
+
+_kernels = _Kernels()
 
 
 def make(number: int, seed: int, folder: Path, sources: list[Path]) -> tuple[Path, str, str]:
@@ -140,7 +175,7 @@ def warm_up(stages: list[Path], command: Callable, together: int = 1) -> None:
 
 def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Callable, device: str = "cpu") -> Verdict:
     """Make a mutant, send it through ``check`` and ``run``, and look at what came of it."""
-    began = _cpu_seconds()
+    began = _cpu_seconds() - _kernels.seconds
     verdict = Verdict(number)
     place = folder / f"{number:05}"
     shutil.rmtree(place, ignore_errors=True)
@@ -171,7 +206,7 @@ def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Ca
         verdict.problems.append(f"failed: {verdict.line}")
     if verdict.run == OK:
         verdict.problems += differences(path, output, simulations[-1] if simulations else None)
-    verdict.seconds = _cpu_seconds() - began
+    verdict.seconds = _cpu_seconds() - _kernels.seconds - began
     return verdict
 
 
@@ -326,11 +361,14 @@ class Campaign:
             resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         command = in_fresh_process if self.fresh else in_process
+        _kernels.begin()
         for number in numbers:
-            limit = int(time.process_time()) + CPU_SECONDS  # of this process alone
+            limit = int(time.process_time()) + CPU_SECONDS + KERNEL_SECONDS  # of this process alone
             resource.setrlimit(resource.RLIMIT_CPU, (limit, resource.RLIM_INFINITY))
             try:
                 verdict = judge(number, self.seed, self.folder, self.sources, command)
+                if verdict.seconds > CPU_SECONDS and not self.fresh:  # starts of interpreters are no stage's fault
+                    verdict.problems.append(f"took {verdict.seconds:.0f} s of CPU time")
             except BaseException:
                 verdict = Verdict(number, problems=[traceback.format_exc()])
             os.write(outward, json.dumps(asdict(verdict)).encode() + b"\n")
