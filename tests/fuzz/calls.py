@@ -23,8 +23,8 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import dataclass, field
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass, field, fields, is_dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -47,9 +47,12 @@ KEYS = Keys(np.array([0.0, 1.0]), np.array([[1.0], [2.0]]), "linear").to_text()
 TIME_STEP = 1e-3  # s
 OFTEN = 50
 """Calls without arguments after which a world is made anew; calls with arguments make it anew if they were taken."""
+KINDS = "coils", "worlds", "gradients", "distant"
+"""Kinds of worlds, each for ``OFTEN`` calls in turn: one with coils, two of it in a model, one whose model requires
+gradients, which voltages of coils have not, and one with a plate that acts by few moments, which coils do not allow."""
 
 
-def new_world(balls: int = 2) -> dict[str, Any]:
+def new_world(balls: int = 2, kind: str = "coils") -> dict[str, Any]:
     """Return right arguments by name: a model of balls, iron, coils and a site, with all that takes its states."""
     builder = newton.ModelBuilder()
     warpmag.register_attributes(builder)
@@ -61,11 +64,18 @@ def new_world(balls: int = 2) -> dict[str, Any]:
             warpmag.add_inducible(builder, body=body)
         else:
             warpmag.add_permanent(builder, body=body, magnetization=M)
-    coil = warpmag.add_coil(builder, body=0, radius=0.01, ampere_turns=1.0, label="coil")
-    warpmag.add_coil(builder, body=0, radius=0.01, wire_radius=1e-4, resistance=1.0, turns=10, label="driven")
     builder.add_site(0, label="site")
-    model = builder.finalize(device="cpu")
-    model.warpmag.current_keys[coil] = KEYS  # as USD's importer leaves them
+    coil = _add_plate(builder) if kind == "distant" else warpmag.add_coil(builder, body=0, radius=0.01, label="coil")
+    if kind in ("coils", "worlds"):
+        warpmag.add_coil(builder, body=0, radius=0.01, wire_radius=1e-4, resistance=1.0, turns=10, label="driven")
+    scene = builder
+    if kind == "worlds":
+        scene = newton.ModelBuilder()
+        warpmag.register_attributes(scene)
+        scene.replicate(builder, 2)
+    model = scene.finalize(device="cpu", requires_grad=kind == "gradients")
+    if kind != "distant":
+        model.warpmag.current_keys[coil] = KEYS  # as USD's importer leaves them
     magnetics, state = warpmag.Magnetics(model), model.state()
     magnetics.apply(state, dt=TIME_STEP)
     viewer = newton.viewer.ViewerNull()
@@ -91,8 +101,19 @@ def new_world(balls: int = 2) -> dict[str, Any]:
             "device": "cpu",
             "dtype": "float32",
             "system": magnetics.system,
+            "worlds": np.zeros(len(POINTS), np.int32),
+            "gradients": True,
+            "kind": kind,
         },
     } | {"sensor": warpmag.SensorMagnetometer(model, magnetics, "site"), "probe": FieldProbe(magnetics.system, 2)}
+
+
+def _add_plate(builder: newton.ModelBuilder) -> int:
+    """Add a plate of iron of more than 64 cells, far from the balls; return its shape."""
+    plate = builder.add_body(xform=wp.transform((0.5, 0.0, 0.0), wp.quat_identity()))
+    shape = builder.add_shape_box(plate, hx=0.03, hy=0.03, hz=0.0015)
+    warpmag.add_inducible(builder, body=plate)
+    return shape
 
 
 def _importable(*names: str) -> dict[str, ModuleType]:
@@ -128,7 +149,7 @@ SINGLE = {
     "sweep": {"simulate": list, "world_count": 4, "together": 2},
 }
 """Right arguments of one function alone."""
-USUAL = ("body", "magnetization", "saturation", "radius", "device", "dtype", "dt")
+USUAL = ("body", "magnetization", "saturation", "radius", "device", "dtype", "dt", "worlds", "gradients")
 """Optional arguments that are given in most calls, as users do."""
 PASSIVE = {"persistent_arrays", "stepped_arrays", "warnings", "frame", "allow_restart", "stay"}
 """Methods without arguments that return no numbers, or only when a viewer is closed."""
@@ -234,7 +255,7 @@ class Caller:
 
     name: str
     seed: int
-    world: dict = field(default_factory=new_world)
+    world: dict = field(default_factory=dict)
     owners: dict[str, Any] = field(default_factory=dict)
 
     def _owned(self, owner: str) -> Any:
@@ -246,16 +267,24 @@ class Caller:
     def _right(self) -> dict:
         """Return right arguments of the function by name, and others."""
         right = self.world | SINGLE.get(self.name, {})
+        if self.name.endswith(".reset"):
+            right["worlds"] = np.ones(max(self.world["model"].world_count, 1), bool)
         if self.name == "Simulation.control":
             right["control"] = self._owned("Simulation").model.control()
+        if self.world["kind"] == "gradients" and self.name in ARRAYS:
+            right["positions"] = wp.array(POINTS, dtype=wp.vec3, device="cpu", requires_grad=True)
         if self.name.startswith("torch."):
             tensor = LIBRARIES["torch"].torch.tensor
             right |= {name: tensor(value) for name, value in right.items() if isinstance(value, np.ndarray)}
+            right["positions"].requires_grad_(self.world["kind"] == "gradients")
         return right
 
     def call(self, number: int, announce: Callable[[str], Any] = lambda _: None) -> Outcome:
         """Make one call, and a right one after it; return what became of it."""
         chance = random.Random(f"{self.seed}-{self.name}-{number}")
+        kind = KINDS[number // OFTEN % len(KINDS)]
+        if self.world.get("kind") != kind:
+            self.world, self.owners = new_world(kind=kind), {}
         function, right = targets()[self.name](self._owned), self._right()
         names = [name for name in inspect.signature(function).parameters if name not in ("args", "options", "overlays")]
         parameters = inspect.signature(function).parameters
@@ -267,9 +296,11 @@ class Caller:
         outcome = Outcome(number, f"{self.name}({', '.join(f'{k}={_short(v)}' for k, v in arguments.items())})")
         announce(outcome.call)
         try:
-            result = function(**arguments)
+            with wp.Tape() if kind == "gradients" else nullcontext() as tape:
+                result = function(**arguments)
             outcome.taken = True
-            if not all(np.isfinite(array).all() for array in _numbers(result)):
+            gradients = _gradients(result, arguments.get("positions"), tape) if self.name.endswith(ARRAYS) else []
+            if not all(np.isfinite(array).all() for array in (*_numbers(result), *gradients)):
                 outcome.problem = f"not finite: {_short(result)}"
         except warpmag.InputError as error:
             if "\n" in str(error) or not 0 < len(str(error)) < 1000:
@@ -287,8 +318,12 @@ class Caller:
         """Use what the call was about, then replace it."""
         try:
             magnetics, state = self.world["magnetics"], self.world["model"].state()
-            magnetics.apply(state, dt=TIME_STEP)
+            with wp.Tape() as tape:
+                magnetics.apply(state, dt=TIME_STEP)
             arrays = [state.body_f.numpy(), magnetics.b_field(POINTS)]
+            if state.requires_grad:
+                tape.backward(grads={state.body_f: wp.ones_like(state.body_f)})
+                arrays.append(state.body_q.grad.numpy())
             if simulation := self.owners.get("Simulation"):
                 simulation.step()
                 arrays.append(simulation.state.body_q.numpy())
@@ -298,7 +333,7 @@ class Caller:
             pass
         except BaseException as error:
             outcome.problem = outcome.problem or f"later {type(error).__name__}: {error}"[:300]
-        self.world, self.owners = new_world(), {}
+        self.world, self.owners = {}, {}
 
 
 def _raised_by(error: BaseException, arguments: dict) -> bool:
@@ -310,13 +345,32 @@ def _raised_by(error: BaseException, arguments: dict) -> bool:
 
 
 def _numbers(result: Any) -> Iterator[np.ndarray]:
-    for part in result if isinstance(result, tuple | list) else [result]:
+    for part in _parts(result):
         if isinstance(part, wp.array) and part.dtype in (wp.float32, wp.vec3):
             yield part.numpy()
         elif hasattr(part, "detach"):
             yield part.detach().numpy()
         elif isinstance(part, np.ndarray | float):
             yield np.asarray(part)
+
+
+def _gradients(result: Any, positions: Any, tape: wp.Tape | None) -> list[np.ndarray]:
+    """Return the gradients of the sum of the results by the positions, if they require one."""
+    parts = [part for part in _parts(result) if getattr(part, "requires_grad", False)]
+    if not parts or not getattr(positions, "requires_grad", False):
+        return []
+    if isinstance(parts[0], wp.array):
+        tape.backward(grads={part: wp.ones_like(part) for part in parts})
+        return [positions.grad.numpy()]
+    sum(part.sum() for part in parts).backward()
+    return [positions.grad.numpy()]
+
+
+def _parts(result: Any) -> list:
+    """Return the arrays of a result: of a sequence, of the fields of a dataclass, or itself."""
+    if is_dataclass(result):
+        return [getattr(result, entry.name) for entry in fields(result)]
+    return list(result) if isinstance(result, tuple | list) else [result]
 
 
 def _short(value: Any) -> str:
@@ -381,7 +435,8 @@ def main() -> int:
     parser.add_argument("--without", default="-", help="part of the names of functions that are left out")
     parser.add_argument("--workers", type=int, default=1, help="functions at a time (default: %(default)s)")
     options = parser.parse_args()
-    new_world()  # kernels are compiled before the first fork
+    for kind in KINDS:  # kernels are compiled before the first fork
+        new_world(kind=kind)
     names = [name for name in targets() if options.only in name and options.without not in name]
     calls = partial(_all_outcomes, seed=options.seed, count=options.count)
     total = 0

@@ -1,4 +1,4 @@
-"""Stages of a hostile author: addresses behind connections, devices, endless lists, slender bodies.
+"""Stages of a hostile author: addresses behind connections, devices, endless lists, slender bodies, odd circuits.
 
 Every fault takes a layer that lies in a folder, the prims of the seed and a source of chance, changes the layer, may
 write files beside it, and returns what it did.
@@ -19,6 +19,10 @@ TEXTURES = (
 KINDS = (*("asset", "string", "token") * 4, "asset[]", "string[]", "int", "color3f")
 TIMES = (0.0, 1.0, 10.0, -1.0, 1e9, 1e12, 1e300, math.inf, math.nan, 1e-9)
 RATIOS = (1e-6, 1e-4, 1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3, 1e4, 1e6)
+DISTANCES = (0.02, 0.1, 0.15, 0.5, 10.0, 1e5)
+"""Distances of plates [m]: those of 60 mm act by few moments from about 0.1 m on."""
+SIZES = (0.0, -1.0, 1e-30, 1e-12, 1e-3, 1.0, 1e12, 1e30, math.inf, math.nan)
+"""Numbers of circuits in their units."""
 SCHEMAS = (
     *("CollectionAPI:c", "PhysicsLimitAPI:", "PhysicsDriveAPI:rot", "OddAPI", "PhysicsMassAPI", "WarpmagMagnetAPI:"),
     *("MaterialBindingAPI", "SemanticsAPI:x", "NewtonArticulationRootAPI", "CoordSysAPI:x", "WarpmagCoilAPI", "x:y:z"),
@@ -164,6 +168,44 @@ def slender(layer, prims, chance) -> str:
     return f"{prim.path} stretched by {first}, {second}"
 
 
+def plate(layer, prims, chance) -> str:
+    """Add a plate of iron, at a distance from everything at which it acts by its cells, or by a few moments."""
+    distance = chance.choice(DISTANCES)
+    prim = _define(layer, f"/Plate{chance.randrange(1000)}", "Cube")
+    apis = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "WarpmagMagnetAPI"]
+    prim.SetInfo("apiSchemas", Sdf.TokenListOp.CreateExplicit(apis))
+    values = {
+        "size": ("double", 1.0),
+        "xformOp:translate": ("double3", Gf.Vec3d(0.0, 0.0, distance)),
+        "xformOp:scale": ("double3", Gf.Vec3d(0.06, 0.06, chance.choice((0.003, 0.02, 1e-4)))),
+        "xformOpOrder": ("token[]", Vt.TokenArray(["xformOp:translate", "xformOp:scale"])),
+        "warpmag:material": ("token", chance.choice(("iron", "mild-steel", "M-19"))),
+    }
+    if chance.random() < 0.3:
+        values["warpmag:conductivity"] = "float", 1e6
+    for name, (kind, value) in values.items():
+        _attribute(prim, name, kind).default = value
+    return f"a plate at {distance}"
+
+
+def circuit(layer, prims, chance) -> str:
+    """Add a coil that answers to a voltage, one of whose numbers is odd."""
+    prim = layer.GetPrimAtPath(chance.choice(prims)) if chance.random() < 0.5 else None
+    prim = prim or _define(layer, f"/Driven{chance.randrange(1000)}", "Xform")
+    before = prim.GetInfo("apiSchemas").GetAppliedItems() if prim.HasInfo("apiSchemas") else []
+    prim.SetInfo("apiSchemas", Sdf.TokenListOp.CreateExplicit([*dict.fromkeys((*before, "WarpmagCoilAPI"))]))
+    numbers = {"radius": 0.02, "wireRadius": 1e-3, "resistance": 2.0, "turns": 100.0, "voltage": 12.0}
+    numbers |= {name: 1e-3 for name in ("inductance", "ampereTurns") if chance.random() < 0.3}
+    odd = chance.choice(sorted(numbers))
+    numbers[odd] = chance.choice(SIZES)
+    for name, value in numbers.items():
+        _attribute(prim, f"warpmag:coil:{name}", "float").default = value
+    if chance.random() < 0.3:
+        for time in (0.0, 10.0):
+            layer.SetTimeSample(prim.path.AppendProperty("warpmag:coil:voltage"), time, chance.choice(SIZES))
+    return f"{prim.path} driven, {odd} {numbers[odd]}"
+
+
 def schemas(layer, prims, chance) -> str:
     """Apply very many schemas, of any names, some several times, or lists that contradict each other."""
     prim, count = layer.GetPrimAtPath(chance.choice(prims)), chance.choice((3, 50, 900, 1_100, 20_000))
@@ -217,6 +259,7 @@ def long_transform(layer, prims, chance) -> str:
 
 HOSTILE: tuple[Callable, ...] = (
     *(texture, texture, texture, clips, clips, slender, slender, schemas, connections, connections, long_transform),
+    *(plate, plate, circuit, circuit),
 )
 
 

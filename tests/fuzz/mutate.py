@@ -46,7 +46,10 @@ TYPES = (
     "matrix4d",
     "asset",
 )
-WORDS = ("", "none", "Z", "x", "tanh", "../..", "convexHull", "Ü" * 300, "1e3")
+WORDS = (
+    *("", "none", "Z", "x", "tanh", "../..", "convexHull", "Ü" * 300, "1e3"),
+    *("zeeman", "theta-euler", "llg", "multipole"),
+)
 METADATA = (
     "metersPerUnit",
     "kilogramsPerUnit",
@@ -91,6 +94,9 @@ AUTHORED = {
     "warpmag:moment": "vector3f",
     "warpmag:externalField": "vector3f",
     "warpmag:rtol": "float",
+    "warpmag:force": "token",
+    "warpmag:dynamics": "token",
+    "warpmag:contactModel": "token",
     "warpmag:curve": "token",
     "warpmag:material": "token",
     "warpmag:recoilPermeability": "float",

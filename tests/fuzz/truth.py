@@ -307,7 +307,8 @@ def _sources(reading, simulation):
             "WarpmagCoilAPI": ("warpmag:coil:ampereTurns", 0.0),
             "WarpmagFieldMapAPI": ("warpmag:fieldMap:factor", 1.0),
         }[kind.pop()]
-        if prim.GetAttribute(name).GetNumTimeSamples() > 1:  # switched meanwhile
+        driven = reading.get(prim, "warpmag:coil:resistance", 0.0)  # its current follows from a voltage
+        if driven or prim.GetAttribute(name).GetNumTimeSamples() > 1:  # switched meanwhile
             continue
         if not math.isclose(reading.get(prim, name, usual), strengths[index], rel_tol=1e-5, abs_tol=1e-30):
             yield f"{name} of {prim.GetPath()}: {strengths[index]:g} for {reading.get(prim, name, usual):g}"

@@ -265,8 +265,10 @@ class Magnetics:
         if dt is None and self.coils is not None:
             raise InputError(f"apply: dt is missing, by which the current of {self.coils.labels[0]} advances")
         with paused_tape() as tape:
-            if tape is not None and self.coils is not None and state.body_q.requires_grad:
-                raise InputError(f"apply: forces with the voltage of {self.coils.labels[0]} have no gradient")
+            if tape is not None:
+                self._check_state(state, "body_q")
+                if self.coils is not None and state.body_q.requires_grad:
+                    raise InputError(f"apply: forces with the voltage of {self.coils.labels[0]} have no gradient")
             self._solve(state, dt, taped=tape is not None and bool(self._gradients.arguments(state)))
             self.add_forces(state)
             if tape is not None:
