@@ -78,7 +78,29 @@ def test_command(monkeypatch, capsys):
     assert all(name in listed for name in SMALL)
     monkeypatch.setattr("sys.argv", ["examples", "ball_up"])
     assert examples.main() == 2
-    assert capsys.readouterr().err.startswith("warpmag: ball_up: no such example, there are arm, balls_up, ")
+    assert capsys.readouterr().err.startswith("warpmag: 'ball_up': no such example, there are arm, balls_up, ")
+
+
+FAULTS = {
+    "'a\\nb': no such example, there are ": ("a\nb",),
+    "device: no 'cuda:9' here; available: ": ("sorter", "--headless", "--device", "cuda:9"),
+    "worlds: the check failed: ": ("worlds", "--headless", "--num-frames", "0", "--describe"),
+}
+
+
+@pytest.mark.parametrize("line", FAULTS)
+def test_faults_are_one_line(line, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["examples", *FAULTS[line]])
+    assert examples.main() == (1 if "check" in line else 2)
+    (told,) = capsys.readouterr().err.splitlines()
+    assert told.startswith(f"warpmag: {line}")
+
+
+def test_a_full_standard_output_is_one_line():
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "warpmag.examples"]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (1, "warpmag: [Errno 28] No space left on device\n")
 
 
 def test_a_viewer_that_cannot_open_is_one_line(monkeypatch, capsys):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import warp as wp
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed")
 
@@ -113,3 +114,14 @@ def test_no_places_at_all(device):
     warpmag.torch.h_field(x, m, nowhere).sum().backward()
     assert x.grad.eq(0.0).all() and m.grad.eq(0.0).all()
     warpmag.torch.wrench(nowhere, nowhere)[0].sum().backward()
+
+
+def test_on_a_tape_of_warp(device):
+    """Warp's active tape neither records the call nor gets in its way."""
+    x, m = tensors(device, (4, 3), (4, 3))
+    expected, _ = warpmag.torch.wrench(x, m)
+    with wp.Tape() as tape:
+        force, _ = warpmag.torch.wrench(x, m)
+        (gradient,) = torch.autograd.grad(force[0, 0], x)
+    assert torch.equal(force, expected) and torch.isfinite(gradient).all()
+    assert not tape.launches

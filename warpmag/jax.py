@@ -37,6 +37,7 @@ from warpmag.declarations.checks import short_repr
 from warpmag.errors import InputError
 from warpmag.moments import fields, induction
 from warpmag.moments.arrays import DTYPES, dtype_name, real_array, resolve_device, shape_message, vec3_type
+from warpmag.moments.tape import paused_tape
 
 _POSITIONAL = inspect.Parameter.POSITIONAL_OR_KEYWORD
 _SCALARS = ("radii", "target_radii", "saturation", "susceptibility")
@@ -198,7 +199,8 @@ class _Call:
 
     def run(self, needed: tuple[str, ...] | None, arrays: dict[str, wp.array]) -> list[wp.array]:
         """Return gradients by ``needed``, or results if that is None."""
-        return self.results(arrays) if needed is None else self.gradients(arrays, needed)
+        with paused_tape():
+            return self.results(arrays) if needed is None else self.gradients(arrays, needed)
 
     def launch(self, needed: tuple[str, ...] | None, arrays: dict, counts: dict[str, int]) -> list:
         """Return the JAX arrays of :meth:`run`; ``counts`` are their lengths by name."""

@@ -29,6 +29,7 @@ from warpmag.errors import InputError
 from warpmag.moments import fields, induction
 from warpmag.moments.arrays import real_array, shape_message
 from warpmag.moments.induction import permanent_dipoles
+from warpmag.moments.tape import paused_tape
 
 _DTYPES = {torch.float32: ("float32", wp.float32, wp.vec3), torch.float64: ("float64", wp.float64, wp.vec3d)}
 """By type of tensors: type of a call, and Warp's types of scalars and vectors."""
@@ -180,14 +181,14 @@ def _recorded(call, tensors: dict, owners: dict[str, str], needed: str):
 
 
 class _Call(torch.autograd.Function):
-    """A call on Warp arrays that records its gradient on a tape of its own."""
+    """A call on Warp arrays that records its gradient on a tape of its own, also while another tape is active."""
 
     @staticmethod
     def forward(ctx, call, names, *tensors):
         """Return the results as tensors that share the memory of the call's results."""
         dtype, scalar, vector = _DTYPES[tensors[0].dtype]
         needed = ctx.needs_input_grad[2:]
-        with _stream(tensors[0]), wp.Tape() as ctx.tape:
+        with _stream(tensors[0]), paused_tape(), wp.Tape() as ctx.tape:
             ctx.arrays = [
                 wp.from_torch(_contiguous(tensor.detach()), scalar if name in _SCALARS else vector, requires_grad=grad)
                 for name, tensor, grad in zip(names, tensors, needed, strict=True)
@@ -199,7 +200,7 @@ class _Call(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, *cotangents):
         """Return the gradients of the tensors that require one."""
-        with _stream(cotangents[0]):
+        with _stream(cotangents[0]), paused_tape():
             leaves = [array if array.requires_grad and array.size else None for array in ctx.arrays]
             for array in leaves:
                 if array is not None:

@@ -179,7 +179,7 @@ def plate(layer, prims, chance) -> str:
         "xformOp:translate": ("double3", Gf.Vec3d(0.0, 0.0, distance)),
         "xformOp:scale": ("double3", Gf.Vec3d(0.06, 0.06, chance.choice((0.003, 0.02, 1e-4)))),
         "xformOpOrder": ("token[]", Vt.TokenArray(["xformOp:translate", "xformOp:scale"])),
-        "warpmag:material": ("token", chance.choice(("iron", "mild-steel", "M-19"))),
+        "warpmag:material": ("token", "iron"),
     }
     if chance.random() < 0.3:
         values["warpmag:conductivity"] = "float", 1e6

@@ -15,9 +15,11 @@ from pathlib import Path
 import newton.examples
 import warp as wp
 
-from warpmag.errors import InputError, extra
+from warpmag.declarations.checks import short_repr
+from warpmag.errors import InputError, extra, one_line
+from warpmag.moments.arrays import resolve_device
 from warpmag.show.viewers import no_viewer
-from warpmag.terminal import quiet_warp
+from warpmag.terminal import log, quiet_warp, silence
 
 __all__ = ["create_parser", "get_examples", "init", "main", "run"]
 
@@ -44,9 +46,11 @@ def init(parser: argparse.ArgumentParser):
         The viewer and the options.
 
     Raises:
-        InputError: The viewer cannot open.
+        InputError: There is no such device, or the viewer cannot open.
     """
     options = parser.parse_args()
+    if options.device:
+        resolve_device(options.device)
     if options.headless:
         sys.argv += ["--viewer", "null"]
     level = max(wp.config.log_level, wp.LOG_WARNING)
@@ -90,7 +94,21 @@ def get_examples() -> dict[str, str]:
 
 
 def main() -> int:
-    """Run the example named on the command line, or list all examples; return the exit code."""
+    """Run the example named on the command line, or list all examples; return the exit code, with one line why."""
+    try:
+        code = _execute()
+        sys.stdout.flush()
+    except InputError as error:
+        log(error)
+        return 2
+    except OSError as error:  # a full disk, or a closed standard output
+        silence(1)
+        log(one_line(str(error)))
+        return 1
+    return code
+
+
+def _execute() -> int:
     examples = get_examples()
     name = sys.argv[1] if len(sys.argv) > 1 else None
     if name in examples:
@@ -99,17 +117,14 @@ def main() -> int:
             example = importlib.import_module(sys.argv[0]).Example
             viewer, options = init(example.create_parser())
             run(example(viewer, options), options)
-        except InputError as error:
-            print(f"warpmag: {error}", file=sys.stderr)
-            return 2
+        except AssertionError as error:  # of ``test_final``
+            log(f"{name}: the check failed: {one_line(str(error))}")
+            return 1
         except ImportError as error:  # a solver of Newton, whose message names the package
-            reason = " ".join(str(error.__cause__ or error).split())
-            print(f"warpmag: {name} needs {extra('sim')}: {reason}", file=sys.stderr)
-            return 2
+            raise InputError(f"{name} needs {extra('sim')}: {one_line(str(error.__cause__ or error))}") from error
         return 0
     if name not in (None, "-h", "--help", "--list"):
-        print(f"warpmag: {name}: no such example, there are {', '.join(examples)}", file=sys.stderr)
-        return 2
+        raise InputError(f"{short_repr(name)}: no such example, there are {', '.join(examples)}")
     print("python -m warpmag.examples NAME [--describe] [--headless] [--viewer gl|viser|usd|null] [--device cuda:0]")
     width = max(map(len, examples))
     for example, line in examples.items():
