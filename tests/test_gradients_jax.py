@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+import warp as wp
 
 jax = pytest.importorskip("jax", reason="JAX is not installed")
 
@@ -96,3 +97,16 @@ def test_wrong_arguments_are_one_line(case, place):
     x, m = arrays((3, 3), (3, 3))
     with pytest.raises(warpmag.InputError, match=f"^{message}$"):
         call(partial(warpmag.jax.h_field, device=place), x, m)
+
+
+def test_on_a_tape_of_warp(place):
+    """Warp's active tape neither records the call nor gets in its way."""
+    x, m = arrays((4, 3), (4, 3))
+
+    def force(x):
+        return warpmag.jax.wrench(x, m, device=place)[0][0, 0]
+
+    expected = jax.grad(force)(x)
+    with wp.Tape() as tape:
+        gradient = jax.grad(force)(x).block_until_ready()
+    assert np.array_equal(gradient, expected) and not tape.launches

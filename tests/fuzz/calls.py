@@ -20,6 +20,7 @@ import os
 import random
 import resource
 import sys
+import tempfile
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
@@ -45,6 +46,7 @@ M = (0.0, 0.0, 1e6)
 POINTS = np.array([(0.0, 0.0, 0.05), (0.02, 0.0, 0.0)])
 KEYS = Keys(np.array([0.0, 1.0]), np.array([[1.0], [2.0]]), "linear").to_text()
 TIME_STEP = 1e-3  # s
+STAGE = str(Path(__file__).with_name("workshop.usda"))
 OFTEN = 50
 """Calls without arguments after which a world is made anew; calls with arguments make it anew if they were taken."""
 KINDS = "coils", "worlds", "gradients", "distant"
@@ -138,7 +140,7 @@ CLASSES = {"FieldProbe": FieldProbe, **{name: getattr(warpmag, name) for name in
 ARRAYS = ("solve_induction", "h_field", "wrench")
 FUNCTIONS = (
     *("register_attributes", "register_custom_attributes", "add_inducible", "add_permanent", "add_balls", "add_coil"),
-    *("add_field_map", "material", "check", "sweep", *ARRAYS),
+    *("add_field_map", "material", "check", "sweep", "render", "export", *ARRAYS),
 )
 CURVES = ("from_bh", "from_mh", "from_csv")
 LIBRARIES = _importable("torch", "jax")
@@ -147,9 +149,11 @@ SINGLE = {
     "MagnetizationCurve.from_csv": {"path": str(Path(__file__).with_name("curve.csv"))},
     "Magnetics.set_voltage": {"coil": "driven"},
     "sweep": {"simulate": list, "world_count": 4, "together": 2},
+    "render": {"stage": STAGE, "output": "calls.png", "size": (16, 9), "frame": 0, "on_camera": str},
+    "export": {"stage": STAGE, "output": "calls.usdc"},
 }
 """Right arguments of one function alone."""
-USUAL = ("body", "magnetization", "saturation", "radius", "device", "dtype", "dt", "worlds", "gradients")
+USUAL = ("body", "magnetization", "saturation", "radius", "device", "dtype", "dt", "worlds", "gradients", "size")
 """Optional arguments that are given in most calls, as users do."""
 PASSIVE = {"persistent_arrays", "stepped_arrays", "warnings", "frame", "allow_restart", "stay"}
 """Methods without arguments that return no numbers, or only when a viewer is closed."""
@@ -379,8 +383,8 @@ def _short(value: Any) -> str:
     return " ".join(repr(value).split())[:80]
 
 
-def _child(name: str, seed: int, numbers: list[int], outward: int) -> None:
-    """Make calls, and write a line before and after each; never return."""
+def _child(name: str, seed: int, numbers: list[int], outward: int, folder: str) -> None:
+    """Make calls, which write files into a folder, and write a line before and after each; never return."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     warnings.simplefilter("ignore")
@@ -388,6 +392,7 @@ def _child(name: str, seed: int, numbers: list[int], outward: int) -> None:
     for descriptor in (1, 2):
         os.dup2(silent, descriptor)
     caller = Caller(name, seed)
+    os.chdir(folder)
 
     def say(kind: str, *parts: Any) -> None:
         os.write(outward, json.dumps([kind, *parts]).encode() + b"\n")
@@ -403,14 +408,18 @@ def _child(name: str, seed: int, numbers: list[int], outward: int) -> None:
 
 def outcomes(name: str, seed: int, numbers: list[int]) -> Iterator[Outcome]:
     """Yield what became of calls of one function; the problem of a call that ended its process is how it did."""
-    left = list(numbers)
+    with tempfile.TemporaryDirectory() as folder:
+        yield from _outcomes(name, seed, list(numbers), folder)
+
+
+def _outcomes(name: str, seed: int, left: list[int], folder: str) -> Iterator[Outcome]:
     while left:
         inward, outward = os.pipe()
         process = os.fork()
         if not process:
             os.close(inward)
             try:
-                _child(name, seed, left, outward)
+                _child(name, seed, left, outward, folder)
             finally:
                 os._exit(1)
         os.close(outward)

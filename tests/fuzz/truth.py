@@ -6,6 +6,7 @@ Nothing of warpmag's own reader is used: bodies, poses, sizes, masses, frictions
 import math
 from pathlib import Path
 
+import newton
 import numpy as np
 from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade
 
@@ -247,7 +248,8 @@ def _shapes(reading, simulation):
     model = simulation.model
     scales, mu = model.shape_scale.numpy(), model.shape_material_mu.numpy()
     restitution = model.shape_material_restitution.numpy()
-    numbers = {label: index for index, label in enumerate(model.shape_label)}
+    sites = model.shape_flags.numpy() & newton.ShapeFlags.SITE  # a coil has the label of the collider that carries it
+    numbers = {label: index for index, label in enumerate(model.shape_label) if not sites[index]}
     for prim in reading.colliders:
         index = numbers.get(str(prim.GetPath()))
         if index is None:

@@ -208,7 +208,7 @@ class RendererStage:
         if source and source.typeName == "Mesh":  # a ball of an instancer has no prim
             Sdf.CopySpec(self._scene, shape.path, stage.GetRootLayer(), path)
             with Sdf.ChangeBlock():
-                _strip(stage.GetRootLayer(), [], below=path)
+                _strip(stage.GetRootLayer(), [], drawn=[str(path)], below=path)  # it may be a body itself
             mesh = UsdGeom.Mesh(stage.GetPrimAtPath(path))
             _transform_to_body(mesh, shape)
         else:
