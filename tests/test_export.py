@@ -267,6 +267,15 @@ def test_a_kinematic_body_that_has_not_moved_stays(tmp_path):
     assert stage.GetPrimAtPath("/World/Magnet").IsA(UsdGeom.Mesh)
 
 
+def test_a_mesh_may_be_a_body_itself(tmp_path):
+    """And not only a shape of a body: the tetrahedron of the workshop."""
+    export(Path(__file__).with_name("fuzz") / "workshop.usda", tmp_path / "out.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "out.usdc"))
+    prototypes = stage.GetPrimAtPath("/World/Render/Bodies/Prototypes").GetChildren()
+    corners = [list(UsdGeom.Mesh(prim).GetFaceVertexIndicesAttr().Get()) for prim in prototypes]
+    assert [0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3] in corners
+
+
 @pytest.mark.parametrize(
     "output,options,message",
     [

@@ -286,7 +286,7 @@ class Caller:
     def call(self, number: int, announce: Callable[[str], Any] = lambda _: None) -> Outcome:
         """Make one call, and a right one after it; return what became of it."""
         chance = random.Random(f"{self.seed}-{self.name}-{number}")
-        kind = KINDS[number // OFTEN % len(KINDS)]
+        kind = KINDS[number // OFTEN % (3 if self.name.startswith("KeyedCurrents") else 4)]  # which need a coil
         if self.world.get("kind") != kind:
             self.world, self.owners = new_world(kind=kind), {}
         function, right = targets()[self.name](self._owned), self._right()

@@ -116,6 +116,21 @@ def check_whole(name: str, value: Any) -> None:
         raise InputError(f"{name}: must be a whole number, got {short_repr(value)}")
 
 
+def whole_pair(name: str, values: Any) -> tuple[int, int]:
+    """Return two whole numbers; raise :class:`InputError` for anything else."""
+    values = plain_value(name, values)
+    try:
+        two = len(values) == 2 and not isinstance(values, _NO_SEQUENCES)
+    except TypeError:  # len() of a zero-dimensional NumPy array raises
+        two = False
+    if not two:
+        raise InputError(f"{name}: must be two whole numbers, got {short_repr(values)}")
+    first, second = values
+    check_whole(name, first)
+    check_whole(name, second)
+    return int(first), int(second)
+
+
 def check_count(name: str, value: Any) -> None:
     """Raise :class:`InputError` unless ``value`` is a whole number from 1 to 2³¹ − 1."""
     check_whole(name, value)

@@ -2,7 +2,8 @@
 
 Each is a module with a class ``Example``: the constructor builds the scene, ``step`` advances one frame, ``render``
 shows it, ``test_final`` compares the result with physics, ``summary`` returns a line about it. ``--test`` calls
-``test_final`` at the end, ``--describe`` also prints the comparison, ``--headless`` draws nothing. May import ``show``.
+``test_final`` at the end, ``--describe`` also prints the comparison, ``--headless`` draws nothing. May import
+``moments`` and ``show``.
 """
 
 import argparse
@@ -15,7 +16,6 @@ from pathlib import Path
 import newton.examples
 import warp as wp
 
-from warpmag.declarations.checks import short_repr
 from warpmag.errors import InputError, extra, one_line
 from warpmag.moments.arrays import resolve_device
 from warpmag.show.viewers import no_viewer
@@ -124,7 +124,7 @@ def _execute() -> int:
             raise InputError(f"{name} needs {extra('sim')}: {one_line(str(error.__cause__ or error))}") from error
         return 0
     if name not in (None, "-h", "--help", "--list"):
-        raise InputError(f"{short_repr(name)}: no such example, there are {', '.join(examples)}")
+        raise InputError(f"{one_line(repr(name))}: no such example, there are {', '.join(examples)}")
     print("python -m warpmag.examples NAME [--describe] [--headless] [--viewer gl|viser|usd|null] [--device cuda:0]")
     width = max(map(len, examples))
     for example, line in examples.items():

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpmag.declarations.checks import check_positive, check_token, short_repr
+from warpmag.declarations.checks import check_flag, check_positive, check_token, short_repr
 from warpmag.deprecation import renamed_arguments
 from warpmag.errors import InputError
 from warpmag.show.magnet_overlays import COLORS, MagnetOverlays
@@ -57,6 +57,8 @@ def export(
     check_positive("fps", fps)
     if not (isinstance(field_lines, int) and field_lines >= 0):
         raise InputError(f"field_lines: must be a whole number from 0 on, got {short_repr(field_lines)}")
+    check_flag("arrows", arrows)
+    check_flag("materialx", materialx)
     if color is not None:
         check_token("color", color, tuple(COLORS))
     if suffix in (".npz", ".csv"):

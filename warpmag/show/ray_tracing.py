@@ -22,7 +22,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.declarations.checks import short_repr
+from warpmag.declarations.checks import check_flag, check_text, check_whole, short_repr, whole_pair
 from warpmag.deprecation import renamed_arguments
 from warpmag.engine.newton_versions import camera_type
 from warpmag.engine.stepping.scene import ImportedScene, import_scene
@@ -38,6 +38,7 @@ from warpmag.usd import (
     perspective_cameras,
     quiet,
     stage_clock,
+    usable_path,
 )
 
 _SAMPLES = 3
@@ -93,12 +94,18 @@ def render(
         The files written.
 
     Raises:
-        InputError: The stage cannot be read, has no such frames, camera or moments, or the pictures cannot be written.
+        InputError: The stage cannot be read, has no such frames, camera or moments, the pictures cannot be written, or
+            an argument has another type.
     """
-    output = Path(output)
+    output, size = usable_path(output), whole_pair("size", size)
     films.check_name(output)
     if min(size) < 1 or max(size) > 2**14:
         raise InputError(f"size: must be 1 to 16384, got {size[0]} x {size[1]}")
+    check_flag("arrows", arrows)
+    if camera is not None:
+        check_text("camera", camera)
+    if not (on_camera is None or callable(on_camera)):
+        raise InputError(f"on_camera: must be a function, got {short_repr(on_camera)}")
     clock = stage_clock(open_deferred(stage)[0])
     numbers, rate = _numbers(stage, clock, output, frame, frames), clock.frames_per_second
     if output.suffix.lower() in films.FILMS:
@@ -109,7 +116,7 @@ def render(
         scene = import_scene(stage, visuals=True, time_code=min(codes[0], clock.end))
         renderer = _StageRenderer(scene, stage, size, arrows)
         line = renderer.choose_camera(camera)
-        if on_camera:
+        if on_camera is not None:
             on_camera(line)
         pictures = (renderer.picture(code) for code in codes)
         return films.write(output, pictures, numbers, rate)
@@ -118,9 +125,13 @@ def render(
 def _numbers(stage, clock: StageClock, output: Path, frame: int | None, frames: tuple[int, int] | None) -> list[int]:
     """Return the numbers of the frames to draw."""
     last = math.floor((clock.end - clock.start) * clock.frames_per_second / clock.time_codes_per_second + 1e-9)
-    if frames is None and frame is None:
+    if frames is not None:
+        first, final = whole_pair("frames", frames)
+    elif frame is not None:
+        check_whole("frame", frame)
+        first = final = frame
+    else:
         return list(range(last + 1)) if output.suffix.lower() in films.FILMS else [last]
-    first, final = frames or (frame or 0, frame or 0)
     if not 0 <= first <= final <= last:
         raise InputError(
             f"frame: {stage} has frames 0 to {last}, got {first}{'' if first == final else f' to {final}'}"
