@@ -21,7 +21,7 @@ from warpmag.kernels.applied.solids import SolidMagnet
 from warpmag.kernels.applied.sources import AppliedSource, SourceKind
 from warpmag.kernels.contacts import solve as contact_solve
 from warpmag.kernels.fmm import expansions, sharing
-from warpmag.kernels.induction.solve_state import BLOCK_CHUNK, largest_chunk
+from warpmag.kernels.induction.solve_state import BLOCK_CHUNK
 from warpmag.kernels.near_contact.images import IronFaces
 from warpmag.kernels.pairs import evaluate, fused_cuda, mirror_cuda, sums_cuda
 from warpmag.kernels.pairs.evaluate import FUSED, GIVEN, LOOP, MIRRORED, REFERENCE, SHORT, PairEvaluation
@@ -362,7 +362,7 @@ def test_systems(which, launches):
     if "advance_moment" in threads:
         assert threads["advance_moment"] == {induced}
     chunks = sum(-(-(middle - first) // BLOCK_CHUNK) for first, middle, _ in ranges)
-    block = max(32, largest_chunk(driven._induction)) if "advance_moment" in threads else BLOCK_CHUNK
+    block = max(32, driven._induction.block_moments) if "advance_moment" in threads else BLOCK_CHUNK
     assert threads["check_convergence"] == {block * chunks}
 
 

@@ -68,6 +68,7 @@ def state_type(dtype):
         row: wp.array[wp.vec4i]  # moment, world, and range of the world's inducible moments, shape [m]
         active: wp.array[int]  # on a GPU the number of rows whose worlds do not rest, then these; None for all
         chunk: wp.array[wp.vec3i]  # range of rows, and world, of each chunk, shape [c]
+        block_moments: int  # on a GPU the number of moments of the largest chunk, rounded up to one of few sizes
         chunk_begin: wp.array[int]  # first chunk of each world, shape [w + 1]
         near: wp.array3d[int]  # on a CPU rows of the neighbors of a chunk's moments, shape [c, CAPACITY, CHUNK]
         near_count: wp.array[int]  # length of the longest list of each vector
@@ -148,6 +149,8 @@ def allocate(worlds, inducible, dtype, device):
     for name, array in arrays.items():
         setattr(state, name, array)
     state.within_bodies = 1
+    largest = max((end - first for first, end, _ in chunks), default=0)
+    state.block_moments = size if on_cpu else next(n for n in _CHUNK_SIZES if n >= largest)
     return state
 
 
@@ -166,13 +169,6 @@ def bind(state, packed, material, moments, rtol: float, max_evaluations: int) ->
     state.saturation, state.slope, state.curve = material.saturation, material.slope, material.curve
     state.common_curve, state.curve_tables = material.common_curve, material.tables
     state.rtol, state.max_evaluations = rtol, max_evaluations
-
-
-def largest_chunk(state) -> int:
-    """Return the number of moments of the largest chunk, rounded up to one of few sizes."""
-    ends = state.chunk.numpy()
-    largest = (ends[:, 1] - ends[:, 0]).max(initial=0)
-    return next(size for size in _CHUNK_SIZES if size >= largest)
 
 
 @cache

@@ -50,7 +50,7 @@ from functools import cache
 
 import warp as wp
 
-from warpmag.kernels.induction.solve_state import COLUMNS, DEPTH, largest_chunk, state_type, world_summation
+from warpmag.kernels.induction.solve_state import COLUMNS, DEPTH, state_type, world_summation
 from warpmag.kernels.material.curves import inverse_curve_ratio
 from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
@@ -197,7 +197,7 @@ class Launches:
             self.begin, self.sweeps = [passes(START, START)], [passes(FIRST_SWEEP, LAST_SWEEP)]
             self.iteration = [passes(MEASURE, ADVANCE)]
         else:
-            largest = largest_chunk(state)
+            largest = state.block_moments
             blocks, block_dim = -(-group * largest // _START_THREADS), max(32, largest)
             width, begin = group * largest // blocks, _begin_kernel(dtype, group, blocks)
             self.begin = [record(begin, (blocks * chunks, width), block_dim=width)]
