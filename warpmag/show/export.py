@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpmag.declarations.checks import check_flag, check_positive, check_token, short_repr
+from warpmag.declarations.checks import check_flag, check_positive, check_token, real_number, short_repr
 from warpmag.deprecation import renamed_arguments
 from warpmag.errors import InputError
 from warpmag.show.magnet_overlays import COLORS, MagnetOverlays
@@ -64,7 +64,7 @@ def export(
     if suffix in (".npz", ".csv"):
         _write_numbers(stage, usable_path(output))
         return []
-    render, notes = RendererStage(stage, rate=fps), []
+    render, notes = RendererStage(stage, rate=real_number("fps", fps)), []
     if (color or arrows or field_lines) and not render.recording.magnets:
         raise InputError(f"{stage}: has no moments to show, since no run has written it")
     magnets = MagnetOverlays(render) if color or arrows or field_lines else None
