@@ -17,7 +17,6 @@ from warpmag.moments.arrays import RADIUS_RANGE
 from warpmag.shapes import lattice, polyhedra
 from warpmag.shapes.demagnetization import Coupling, coupling
 from warpmag.shapes.flat_faces import FlatFaces, faces_of_mesh, faces_of_polyhedron, joined
-from warpmag.shapes.linear_cells import with_slopes
 from warpmag.shapes.polyhedra import Moments, Polyhedron
 from warpmag.shapes.shape_cache import FOLDER, ShapeCache
 from warpmag.shapes.solids import boxes_meet
@@ -147,6 +146,8 @@ class ShapeSampler:
             return BodyLattice(filled.positions, filled.volumes, filled.inner_radii, counts, solids=tuple(parts))
         cells = coupling(filled, filled.radii)
         if not permanent:
+            from warpmag.shapes.linear_cells import with_slopes  # noqa: PLC0415 - SciPy takes a while
+
             cells = with_slopes(cells, filled)
         with contextlib.suppress(np.linalg.LinAlgError):  # long wires keep the response of their cells
             cells = with_surface_response(cells, filled, solids)
