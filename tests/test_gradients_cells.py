@@ -12,9 +12,7 @@ EXACT = 1e-6
 DIPOLES = (([0.022, 0.003, 0.004], [0.3, -0.2, 0.5]), ([-0.004, 0.019, -0.006], [0.1, 0.4, 0.2]))
 
 
-@pytest.mark.parametrize(
-    "half", [(0.006, 0.006, 0.004), (0.014, 0.007, 0.004)]
-)  # with and without a collective response
+@pytest.mark.parametrize("half", [(0.006, 0.006, 0.004), (0.014, 0.007, 0.004)])
 def test_pose_of_a_body(half, device):
     body, rng = filled([lattice.box(half)], 0.0), np.random.default_rng(2)
     settings = {"saturation": 1.2e6, "susceptibility": 80.0, "external_field": (3e4, -1e4, 8e4), "rtol": 1e-11}
