@@ -11,7 +11,6 @@ bodies. So momentum and angular momentum are conserved by construction. Forces o
 (``expansion``) act at the balls' centers.
 """
 
-import itertools
 from functools import cache
 
 import numpy as np
@@ -22,6 +21,7 @@ from warpmag.kernels.applied.sources import FieldSources, SourceKind, source_arr
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
+from warpmag.kernels.shared.pieces import cut
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
@@ -106,13 +106,12 @@ class AppliedField:
     def _chunks(self, worlds, chosen) -> tuple[wp.array, wp.array]:
         """Return the chunks of chosen targets, each in one world, and their ranges of coils and maps."""
         sources, worlds = self.sources, np.where(chosen, worlds, -1)
-        edges, starts = np.flatnonzero(np.diff(worlds, prepend=-1, append=-1)), []
-        for begin, end in itertools.pairwise(edges):
-            if worlds[begin] >= 0:
-                starts += [(k, min(CHUNK, end - k)) for k in range(begin, end, CHUNK)]
-        starts = np.array(starts, int).reshape(-1, 2)
-        world = worlds[starts[:, 0]].astype(int)
-        chunks = self._integers(np.concatenate([starts, sources.bodies_of(world)], axis=1), wp.vec4i)
+        edges = np.flatnonzero(np.diff(worlds, prepend=-1, append=-1))
+        begin, end = edges[:-1], edges[1:]
+        of_world = worlds[begin] >= 0
+        _, first, last = cut(begin[of_world], end[of_world], CHUNK)
+        world = worlds[first].astype(int)
+        chunks = self._integers(np.column_stack([first, last - first, sources.bodies_of(world)]), wp.vec4i)
         return chunks, self._integers(np.stack([sources.lists[world], sources.lists[world + 1]], axis=1), wp.vec2i)
 
     def run_passes(self, first: int, last: int, items: int, group: int, share: int):
@@ -277,24 +276,27 @@ class AppliedForces(AppliedField):
 
     def _lay_out_rows(self, cell_worlds):
         """List the rows of each reaction that is computed: ranges of targets, of balls and of cells."""
-        sources, rows, begin = self.sources, [], [0]
+        sources, parts = self.sources, []
         item_worlds = {OF_TARGETS: self._worlds, OF_BALLS: self._ball_worlds, OF_CELLS: cell_worlds}
-        movable = [source.movable for source in sources.applied] + [solid.movable for solid in sources.solids]
-        for s, source in enumerate((*sources.applied, *sources.solids)):
-            for kind, worlds in item_worlds.items():
-                if not movable[s] or (kind == OF_CELLS and s < len(sources.applied)):
-                    continue
-                first, end = np.searchsorted(worlds, [source.world, source.world + 1])
-                step = max(_PER_ROW[kind], -(-(end - first) // _MOST_ROWS))
-                rows += [(s, k, min(k + step, end), kind) for k in range(first, end, step)]
-            begin.append(len(rows))
+        of_source = (*sources.applied, *sources.solids)
+        movable = np.array([source.movable for source in of_source], bool)
+        world = np.array([source.world for source in of_source], int)
+        is_solid = np.arange(len(of_source)) >= len(sources.applied)
+        for kind, worlds in item_worlds.items():
+            first, end = np.searchsorted(worlds, world), np.searchsorted(worlds, world + 1)
+            reacts = movable & is_solid if kind == OF_CELLS else movable
+            step = np.maximum(_PER_ROW[kind], -(-(end - first) // _MOST_ROWS))
+            source, *ends = cut(first, np.where(reacts, end, first), step)
+            parts.append(np.column_stack([source, *ends, np.full(len(source), kind)]))
+        rows = np.concatenate(parts)
+        rows = rows[np.argsort(rows[:, 0], kind="stable")]
         arrays, dtype, device = self.arrays, sources.dtype, self.device
-        arrays.row = self._integers(np.array(rows, int).reshape(-1, 4), wp.vec4i)
-        arrays.row_begin = self._integers(begin)
+        arrays.row = self._integers(rows, wp.vec4i)
+        arrays.row_begin = self._integers(np.searchsorted(rows[:, 0], np.arange(len(world) + 1)))
         arrays.partial = wp.zeros((len(rows), 6), dtype=dtype, device=device)
         self.wrenches = arrays.wrench = wp.zeros((len(movable), 7), dtype=dtype, device=device)
         world_has_several_solids = len(sources.solids) > len(np.unique(sources.solid_worlds))
-        self._reacts, self._adds = bool(rows), bool(rows) or world_has_several_solids
+        self._reacts, self._adds = len(rows) > 0, len(rows) > 0 or world_has_several_solids
 
     def enable_rates(self, motion):
         """Evaluate the rates of change of fields from now on.

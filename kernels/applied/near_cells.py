@@ -93,6 +93,18 @@ def _axes(rotation: np.ndarray) -> np.ndarray:
     return (axes + w * twice + np.cross(vector, twice)).ravel()
 
 
+def _table(coupling, kind: int, scalar) -> dict[str, np.ndarray]:
+    """Return the arrays of the cells of the ``kind``-th shape, by their names in :func:`cell_arrays_type`."""
+    count = len(coupling.radii)
+    bits = coupling.outer_faces @ (1 << np.arange(6))
+    return {
+        "form": np.column_stack([bits, np.full(count, kind)]).astype(np.int32),
+        "box": np.column_stack([coupling.half_sides, np.zeros(count)]).astype(scalar),
+        "neighbor": (coupling.neighbor - np.arange(count)[:, None]).astype(np.int32),
+        "weight": coupling.weights.astype(scalar),
+    }
+
+
 def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solid_ranges, movable, dtype, device):
     """Fill the struct ``arrays`` for bodies of cells; None stands for a body that takes no part.
 
@@ -107,38 +119,34 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solid_rang
     """
 
     def put(values, kind=wp.int32):
-        values = np.ascontiguousarray(values, float if kind == dtype else np.int32)
-        return wp.array(values, dtype=kind, device=device)
+        return wp.array(np.ascontiguousarray(values), dtype=kind, device=device)
 
-    cells, forms, boxes, neighbors, weights = [], [], [], [], []
-    grids, tables = np.zeros((len(bodies), 9)), {}
-    for number, body in enumerate(bodies):
-        if body is None:
-            continue
-        coupling, count = body.coupling, len(body.coupling.radii)
-        table = tables.setdefault(id(coupling), (len(tables), body.response))
-        moments = body.first + np.arange(count)
-        cells.append(np.column_stack([moments, np.full(count, number), solid_ranges[moments]]))
-        bits = coupling.outer_faces @ (1 << np.arange(6))
-        forms.append(np.column_stack([bits, np.full(count, table[0])]))
-        boxes.append(np.column_stack([coupling.half_sides, np.zeros(count)]))
-        neighbors.append(coupling.neighbor - np.arange(count)[:, None])
-        weights.append(coupling.weights)
-        grids[number] = _axes(coupling.grid_rotation)
-    order = np.argsort(np.concatenate([rows[:, 0] for rows in cells]), kind="stable")
-    arrays.cell = put(np.concatenate(cells)[order], wp.vec4i)
-    arrays.form = put(np.concatenate(forms)[order], wp.vec2i)
-    arrays.box, arrays.grid = put(np.concatenate(boxes)[order], dtype), put(grids, dtype)
-    arrays.neighbor = put(np.concatenate(neighbors)[order])
-    arrays.weight = put(np.concatenate(weights)[order], dtype)
-    arrays.rotation, arrays.point = rotations, put(unit_points().ravel(), dtype)
-    arrays.response = put(np.concatenate([matrices.ravel() for _, matrices in tables.values()]), dtype)
+    numbers = sorted((k for k, body in enumerate(bodies) if body is not None), key=lambda k: bodies[k].first)
+    used = [bodies[number] for number in numbers]
+    # bodies of many worlds have few shapes: cells are gathered from one table for each shape
+    of_shape = {id(body.coupling): body for body in used}
+    kinds, shapes = {key: k for k, key in enumerate(of_shape)}, list(of_shape.values())
+    kind = np.array([kinds[id(body.coupling)] for body in used])
+    tables = [_table(body.coupling, k, wp.dtype_to_numpy(dtype)) for k, body in enumerate(shapes)]
+    sizes = np.array([len(table["form"]) for table in tables])
+    counts, begins = sizes[kind], (np.cumsum(sizes) - sizes)[kind]
+    within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    row, moments = within + np.repeat(begins, counts), within + np.repeat([body.first for body in used], counts)
+    for name, warp_type in (("form", wp.vec2i), ("box", dtype), ("neighbor", wp.int32), ("weight", dtype)):
+        setattr(arrays, name, put(np.concatenate([table[name] for table in tables])[row], warp_type))
+    columns = moments, np.repeat(numbers, counts), *solid_ranges[moments].T
+    arrays.cell = put(np.stack([column.astype(np.int32) for column in columns], axis=1), wp.vec4i)
+    grids = np.zeros((len(bodies), 9))
+    grids[numbers] = np.array([_axes(body.coupling.grid_rotation) for body in shapes])[kind]
+    arrays.grid, arrays.rotation, arrays.point = put(grids, dtype), rotations, put(unit_points().ravel(), dtype)
+    arrays.response = put(np.concatenate([body.response.ravel() for body in shapes]), dtype)
     arrays.movable = put(movable)
-    arrays.near = wp.zeros(len(order), dtype=wp.int32, device=device)
+    arrays.near = wp.zeros(len(row), dtype=wp.int32, device=device)
     arrays.change, arrays.steepness = (
-        wp.zeros(len(order), dtype=wp.types.vector(3, dtype), device=device) for _ in range(2)
+        wp.zeros(len(row), dtype=wp.types.vector(3, dtype), device=device) for _ in range(2)
     )
-    arrays.potential = wp.zeros(len(order) * 6 * FACE_POINTS, dtype=dtype, device=device)
+    # large, and read only where a pass has written it before: zeros would take longer than all else on a CPU
+    arrays.potential = wp.empty(len(row) * 6 * FACE_POINTS, dtype=dtype, device=device)
 
 
 @cache

@@ -51,11 +51,8 @@ class SolidMagnet:
 
     def size(self) -> list[float]:
         """Return the body's row of ``size``."""
-        lower, upper = self.shape.corners.min(axis=0), self.shape.corners.max(axis=0)
-        center = 0.5 * (lower + upper)
-        radius = np.linalg.norm(self.shape.corners - center, axis=1).max()
         reaches = self.reach, max(self.reach, self.far_reach)
-        return [self.response or 1.0 / self.volume, *reaches, radius, *center, *(0.5 * (upper - lower))]
+        return [self.response or 1.0 / self.volume, *reaches, *self.shape.bounds]
 
 
 def tables_of(solids, *, fine: bool = False) -> dict[str, np.ndarray]:

@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
+from warpmag.kernels.shared.pieces import cut
 from warpmag.kernels.shared.reductions import group_threads, most_blocks
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
@@ -135,10 +136,8 @@ class CellCouplings:
 
     def _lay_out(self, bodies, dtype, device):
         """Fill the arrays."""
-        c, first_rows, tables, chunks, body = self._couplings, {}, [], [], []
-        sides, weights = [], []
-        first_row = np.zeros(len(bodies), int)
-        for number, (first, coupling) in enumerate(bodies):
+        c, first_rows, tables, sides, weights = self._couplings, {}, [], [], []
+        for _, coupling in bodies:
             if id(coupling) not in first_rows:
                 first_rows[id(coupling)] = CHUNK * sum(len(slots) for slots, _, _ in tables)
                 tables.append(_table(coupling.start, coupling.other, coupling.grid_tensor.reshape(-1, 9)))
@@ -146,11 +145,11 @@ class CellCouplings:
                 padding = (0, 0), (0, -len(coupling.radii) % CHUNK)
                 for parts, value in zip((sides, weights), values, strict=True):
                     parts.append(np.pad(value.T, padding))
-            count, row = len(coupling.start) - 1, CHUNK * len(chunks)
-            first_row[number] = row
-            starts = range(0, count, CHUNK)
-            chunks += [(first + k, min(CHUNK, count - k), row, first_rows[id(coupling)]) for k in starts]
-            body += [number] * len(starts)
+        first = np.array([first for first, _ in bodies])
+        body, begin, end = cut(first, first + [len(coupling.radii) for _, coupling in bodies], CHUNK)
+        first_row = CHUNK * np.searchsorted(body, np.arange(len(bodies) + 1))
+        table_row = np.array([first_rows[id(coupling)] for _, coupling in bodies])
+        chunks = np.stack([begin, end - begin, first_row[body], table_row[body]], axis=1)
         slots, others, tensors = (np.concatenate(parts) for parts in zip(*tables, strict=True))
 
         def put(values, kind):
@@ -158,12 +157,11 @@ class CellCouplings:
 
         c.slot_begin = put(np.append(0, np.cumsum(slots)).astype(np.int32), wp.int32)
         c.other, c.tensor = put(others.reshape(-1), wp.int32), put(tensors.reshape(-1), dtype)
-        c.chunk, c.body = put(np.array(chunks, np.int32), wp.vec4i), put(np.array(body, np.int32), wp.int32)
+        c.chunk, c.body = put(chunks.astype(np.int32), wp.vec4i), put(body.astype(np.int32), wp.int32)
         identity = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(bodies), 4))
         c.rotation = put(identity, wp.types.quaternion(dtype))
         c.grid = put([coupling.grid_rotation for _, coupling in bodies], wp.types.quaternion(dtype))
-        ends = first_row + CHUNK * np.bincount(body, minlength=len(bodies))
-        c.rows = put(np.stack([first_row, ends], axis=1).astype(np.int32), wp.vec2i)
+        c.rows = put(np.stack([first_row[:-1], first_row[1:]], axis=1).astype(np.int32), wp.vec2i)
         c.matrix = put(np.concatenate([coupling.grid_common.ravel() for _, coupling in bodies]), dtype)
         c.common = wp.zeros(3 * len(bodies), dtype=dtype, device=device)
         c.side, c.weight = put(np.concatenate(sides, axis=1), wp.int32), put(np.concatenate(weights, axis=1), dtype)

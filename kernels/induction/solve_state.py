@@ -11,6 +11,7 @@ import warp as wp
 
 from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.shared.native import CHUNK, LINE
+from warpmag.kernels.shared.pieces import cut
 from warpmag.kernels.shared.reductions import block_max, block_sum, fence
 
 DEPTH = 5  # changes between iterates that are stored and mixed (``anderson.h``)
@@ -116,7 +117,7 @@ def allocate(worlds, inducible, dtype, device):
     begin = np.searchsorted(worlds, np.arange(world_count))
     rows = np.stack([target, world, begin[world], (begin + counts)[world]], axis=1)
     ends = np.cumsum(counts)
-    chunks = [(a, min(a + size, end), w) for w, end in enumerate(ends) for a in range(end - counts[w], end, size)]
+    of_world, first, last = cut(ends - counts, ends, size)
     chunk_begin = np.append(0, np.cumsum(-(-counts // size)))
     vec3 = wp.types.vector(3, dtype)
 
@@ -126,10 +127,10 @@ def allocate(worlds, inducible, dtype, device):
     def zeros(names, shape, kind=wp.int32):
         return {name: wp.zeros(shape, dtype=kind, device=device) for name in names.split()}
 
-    count, vectors = len(chunks), CHUNK // (64 // wp.types.type_size_in_bytes(dtype)) if on_cpu else 1
+    count, vectors = len(first), CHUNK // (64 // wp.types.type_size_in_bytes(dtype)) if on_cpu else 1
     arrays = {
         "row": put(rows, wp.vec4i),
-        "chunk": put(np.reshape(chunks, (-1, 3)), wp.vec3i),
+        "chunk": put(np.stack([first, last, of_world], axis=1), wp.vec3i),
         "chunk_begin": put(chunk_begin, wp.int32),
         "converged": put(np.ones(world_count), wp.int32),  # worlds without inducible moments count as converged
         **zeros("near", (count if on_cpu else 0, CAPACITY, CHUNK)),
@@ -149,7 +150,7 @@ def allocate(worlds, inducible, dtype, device):
     for name, array in arrays.items():
         setattr(state, name, array)
     state.within_bodies = 1
-    largest = max((end - first for first, end, _ in chunks), default=0)
+    largest = np.max(last - first, initial=0)
     state.block_moments = size if on_cpu else next(n for n in _CHUNK_SIZES if n >= largest)
     return state
 

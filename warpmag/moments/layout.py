@@ -133,19 +133,20 @@ class MomentMaterial:
     """Magnetic material of n moments. The values of permanent moments are ignored.
 
     A curve is one of ``magnets.CURVES``, or a measured ``MagnetizationCurve``, which also determines saturation and
-    susceptibility. A tuple or list holds one curve for each moment. ``magnets.LINEAR_CURVE`` is the response of a
-    permanent magnet of recoil permeability 1 + χ. A formula is a function of the field inside for cells, of the field
-    of all others for balls.
+    susceptibility. A tuple or list holds one curve for each moment, or for each run of ``curve_counts`` moments.
+    ``magnets.LINEAR_CURVE`` is the response of a permanent magnet of recoil permeability 1 + χ. A formula is a function
+    of the field inside for cells, of the field of all others for balls.
     """
 
     saturation: Any = 1.0  # saturation magnetization Ms [A/m], scalar or [n]
     susceptibility: Any = math.inf  # [dimensionless], scalar or [n]
     curve: Any = "tanh"
+    curve_counts: Any = None  # moments of each curve of a list; None for one each
 
     def parameters(self, layout: MomentLayout, dtype, device) -> tuple[CurveParameters, np.ndarray]:
         """Return the material for kernels, and the susceptibility of each moment, 1 for a permanent one, shape [n]."""
         permanent, n = layout.permanent, len(layout.permanent)
-        ids, measured = _curve_ids(self.curve, layout.cells)
+        ids, measured = _curve_ids(self.curve, self.curve_counts, layout.cells)
         saturation = np.where(permanent, 1.0, host_scalars("saturation", self.saturation, n))
         susceptibility = host_scalars("susceptibility", self.susceptibility, n, infinite=True)
         susceptibility = np.where(permanent, 1.0, susceptibility)
@@ -185,12 +186,12 @@ def _slope(susceptibility):
     return 3.0 / (1.0 + 3.0 / susceptibility)
 
 
-def _curve_ids(curve, cells: np.ndarray) -> tuple[np.ndarray, list[MagnetizationCurve]]:
+def _curve_ids(curve, counts, cells: np.ndarray) -> tuple[np.ndarray, list[MagnetizationCurve]]:
     """Return the number by which kernels select each moment's curve, shape [n], and the list of measured curves."""
     n = len(cells)
-    is_list = isinstance(curve, (tuple, list)) and len(curve) == n
+    is_list = isinstance(curve, (tuple, list)) and (counts is not None or len(curve) == n)
     measured: dict[MagnetizationCurve, int] = {}
-    numbers: dict[int, tuple[int, int]] = {}  # of a ball and a cell; by identity, because a body's moments share it
+    numbers: dict[int, tuple[int, int]] = {}  # of a ball and a cell; by identity, because many magnets share it
 
     def number(curve) -> tuple[int, int]:
         if isinstance(curve, MagnetizationCurve):
@@ -204,6 +205,6 @@ def _curve_ids(curve, cells: np.ndarray) -> tuple[np.ndarray, list[Magnetization
     for item in curve if is_list else (curve,):
         if id(item) not in numbers:
             numbers[id(item)] = number(item)
-    ids = [numbers[id(item)] for item in curve] if is_list else numbers[id(curve)]
-    of_ball, of_cell = np.broadcast_to(np.reshape(np.asarray(ids, np.int32), (-1, 2)), (n, 2)).T
+    ids = np.array([numbers[id(item)] for item in (curve if is_list else (curve,))], np.int32).reshape(-1, 2)
+    of_ball, of_cell = np.broadcast_to(ids if counts is None else np.repeat(ids, counts, axis=0), (n, 2)).T
     return np.where(cells, of_cell, of_ball), list(measured)

@@ -109,7 +109,7 @@ class Coupling:
             return self.slopes.tensor
         return full_tensors(rotated(self.tensor, rotate(self.grid_rotation[None], np.eye(3))))
 
-    @property
+    @cached_property
     def grid_common(self) -> np.ndarray:
         """C in the frame of the grid, shape [3, 3]."""
         turn = rotate(self.grid_rotation[None], np.eye(3))

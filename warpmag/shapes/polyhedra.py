@@ -46,6 +46,17 @@ class Polyhedron:
         return Polyhedron(self.corners @ np.asarray(rotation).T + position, self.faces)
 
     @cached_property
+    def bounds(self) -> tuple[float, ...]:
+        """Radius of the sphere around the corners, center of the bounding box, half sides of the box [m], shape [7].
+
+        The sphere has the center of the box.
+        """
+        lower, upper = self.corners.min(axis=0), self.corners.max(axis=0)
+        center = 0.5 * (lower + upper)
+        radius = np.linalg.norm(self.corners - center, axis=1).max()
+        return tuple(map(float, (radius, *center, *(0.5 * (upper - lower)))))
+
+    @cached_property
     def normals(self) -> np.ndarray:
         """Outward unit normals of the faces, shape [f, 3]."""
         a, b, c = (self.corners[[face[k] for face in self.faces]] for k in range(3))

@@ -141,12 +141,13 @@ class DistantMagnets:
         arrays.pattern_count = records[0].patterns.shape[1]
         arrays.strengths = wp.zeros((len(records), arrays.pattern_count), dtype=float, device=self._model.device)
         many = self._many
+        number = {k: row for row, k in enumerate(indices)}
         source, cell = np.full(len(many.volumes), -1), np.full((len(many.volumes), 2), -1)
         for k, magnet in enumerate(many.magnets):
             own = slice(many.first[k], many.first[k + 1])
             count = len(magnet.lattice.volumes)
             if k in bodies:
-                cell[own] = np.stack([np.full(count, indices.index(k)), np.arange(count)], axis=1)
+                cell[own] = np.stack([np.full(count, number[k]), np.arange(count)], axis=1)
             elif not magnet.magnet.fixed:
                 source[own] = first[k] + np.arange(count)
         coupled = [k for k, magnet in enumerate(many.magnets) if magnet.lattice.coupling is not None]

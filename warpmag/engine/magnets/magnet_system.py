@@ -52,7 +52,8 @@ def make_system(
         material=MomentMaterial(
             per_moment([material.saturation for material in materials]),
             per_moment([m.recoil_permeability - 1.0 if m.recoils else m.susceptibility for m in materials]),
-            [magnet_curve for magnet_curve, count in zip(curves, counts, strict=True) for _ in range(count)],
+            curves,
+            curve_counts=counts,
         ),
         external_field=settings.external_field,
         settings=SolverSettings(
