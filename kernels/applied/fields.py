@@ -22,7 +22,7 @@ from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.pieces import cut
-from warpmag.kernels.shared.reductions import group_threads
+from warpmag.kernels.shared.reductions import group_threads, most_blocks
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
 AT_TARGETS, AT_POINTS, AT_CELLS, AT_NEIGHBORS, AT_BALLS, ON_CELLS, REACT, ADD_UP = range(
@@ -122,6 +122,9 @@ class AppliedField:
             switches = bool(sources.applied), bool(sources.solids), self.cell_count > 0, bool(self.rates)
             kernel = _kernel(sources.dtype, *pass_and_group, *switches, self.balls)
             sizes = dict(threads=threads_for(items, share), gpu_threads=group * items)
+            of_cells = dict.fromkeys((AT_CELLS, AT_NEIGHBORS, ON_CELLS), self.arrays.cells.active)
+            active = {AT_TARGETS: self.arrays.targets.active, **of_cells}.get(first)
+            sizes["max_blocks"] = most_blocks(self.device) if active else 0
             self._commands[key] = launch_passes(
                 kernel, first, last + 1, self.arrays, device=self.device, record_cmd=True, **sizes
             )
@@ -140,11 +143,11 @@ class AppliedField:
     def launch_left_out(self):
         """Launch the evaluation at the targets that :meth:`launch` leaves out; not to be captured in a graph."""
         targets = self.arrays.targets
-        needed = targets.chunk, targets.lists
-        for chunks in (self._left_out, needed):
-            targets.chunk, targets.lists = chunks
+        needed = targets.chunk, targets.lists, targets.active
+        for chunks in ((*self._left_out, None), needed):
+            targets.chunk, targets.lists, targets.active = chunks
             self._commands.pop((AT_TARGETS, AT_TARGETS), None)
-            if chunks is self._left_out:
+            if chunks is not needed:
                 self._launch_at_targets()
 
     def _launch_at_targets(self):
@@ -322,6 +325,16 @@ class AppliedForces(AppliedField):
         if first == REACT:
             self.run_passes(REACT, REACT, rows, _GROUP, 1)
         self.run_passes(ADD_UP, ADD_UP, sources, _GROUP, 1)
+
+    def list_active(self, list_active):
+        """Evaluate only targets and cells of worlds that do not rest from now on, on a GPU.
+
+        ``list_active`` returns for targets or cells, a Warp array, their list on the device: a number, then indices.
+        """
+        self.arrays.targets.active = list_active(self.arrays.targets.chunk)
+        if self.cell_count:
+            self.arrays.cells.active = list_active(self.arrays.cells.cell)
+        self._commands.clear()
 
     def write_image_factors(self, moments, radii, material):
         """Launch :func:`near_cells.launch_image_factors` if there are cells."""

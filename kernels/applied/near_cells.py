@@ -12,6 +12,7 @@ import warp as wp
 
 from warpmag.kernels.material.curves import curve_slope, inverse_curve_ratio
 from warpmag.kernels.shared.native import native_options
+from warpmag.kernels.shared.reductions import most_blocks
 
 FACE_SPLIT = 4  # squares along each side of a face
 FACE_POINTS = FACE_SPLIT**2  # points of a face; as in ``near_cells.h``
@@ -46,6 +47,7 @@ def cell_arrays_type(dtype):
         box: wp.array2d[dtype]  # half sides [m], and (μ − 1)/(μ + 1) at the last forces, shape [cells, 4]
         neighbor: wp.array2d[int]  # index of the neighbor on each side, less that of the cell, shape [cells, 6]
         weight: wp.array2d[dtype]  # weights of a cell and of its neighbors in its differences, shape [cells, 12]
+        active: wp.array[int]  # on a GPU the number of cells that are evaluated, then these; None for all
         # Bodies, shape [bodies]:
         rotation: wp.array[quaternion]  # from each body's frame to the world
         grid: wp.array2d[dtype]  # axes of the grid in the body's frame, shape [bodies, 9]
@@ -164,6 +166,10 @@ def _image_factor_kernel(dtype):
         cells: cells_struct,
     ):
         c = wp.tid()
+        if cells.active:
+            if c >= cells.active[0]:
+                return
+            c = cells.active[c + 1]
         i = cells.cell[c][0]
         k, volume = slope[i], dtype(4.18879020478639) * radii[i] * radii[i] * radii[i]
         reduced = wp.length(moments[i]) / (volume * saturation[i])
@@ -185,7 +191,8 @@ def launch_image_factors(arrays, moments, radii, material):
     """
     values = moments, radii, material.saturation, material.slope, material.curve, material.tables
     kernel = _image_factor_kernel(arrays.box.dtype)
-    wp.launch(kernel, arrays.cell.shape[0], inputs=[*values, arrays], device=moments.device)
+    most = most_blocks(moments.device) if arrays.active else 0
+    wp.launch(kernel, arrays.cell.shape[0], inputs=[*values, arrays], max_blocks=most, device=moments.device)
 
 
 def energies(arrays) -> np.ndarray:

@@ -11,6 +11,7 @@
 #include "applied/body_pairs.h"
 #include "applied/near_cells.h"
 #include "applied/rates.h"
+#include "shared/active.h"
 #include "shared/team.h"
 
 namespace warpmag {
@@ -231,6 +232,17 @@ template <class Arrays> CUDA_CALLABLE inline bool has_bodies(const Arrays& array
     return cell[2] < cell[3];
 }
 
+#if defined(__CUDA_ARCH__)
+// Item ``n`` of the pass: of targets and cells only those whose worlds do not rest, −1 beyond the last.
+template <class Arrays> CUDA_CALLABLE inline int listed_item(const Arrays& arrays, int n) {
+    if constexpr (PASS == AT_TARGETS) {
+        const int chunk = active_item(arrays.targets.active, n / CHUNK);
+        return chunk < 0 ? chunk : CHUNK * chunk + n % CHUNK;
+    }
+    return PASS == AT_CELLS || PASS == AT_NEIGHBORS || PASS == ON_CELLS ? active_item(arrays.cells.active, n) : n;
+}
+#endif
+
 template <class Word, class Arrays>
 CUDA_CALLABLE inline void apply_sources(int thread, int first, int last, int threads, Word* team,
                                         const Arrays& arrays) {
@@ -253,7 +265,8 @@ CUDA_CALLABLE inline void apply_sources(int thread, int first, int last, int thr
             if (pass == ADD_UP) add_up(arrays, i);
     };
 #if defined(__CUDA_ARCH__)
-    run_item(PASS, thread / GROUP);
+    const int item = listed_item(arrays, thread / GROUP);
+    if (item >= 0) run_item(PASS, item);
 #else
     auto item_count = [&](int pass) {
         switch (pass) {

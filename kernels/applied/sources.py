@@ -117,6 +117,7 @@ def target_arrays_type(dtype):
         # Chunks of targets, each in one world, shape [chunks]:
         chunk: wp.array[wp.vec4i]  # first target, number of targets, range of permanent bodies
         lists: wp.array[wp.vec2i]  # range of ``coils.list``
+        active: wp.array[int]  # on a GPU the number of chunks that are evaluated, then these; None for all
         # Data out, shape [t]:
         field: wp.array[vec3]  # magnetizing field: base and the field of all sources [A/m]
         acting: wp.array[vec3]  # field that exerts torques: base and the field of other bodies' sources [A/m]

@@ -2,7 +2,7 @@
 //
 // SPREAD writes moments and half the difference D m of the halves of each cell (``warpmag.shapes.linear_cells``). SHARE
 // computes the field that all cells of a body share. TURN copies the fields of the differences by rows. ADD adds Dᵀ of
-// them, the tensors' fields, and the shared field. Everything is in the
+// them, the tensors' fields, and the shared field. Where no cell has slopes, the differences are 0. Everything is in the
 // frame of the body's grid. On a CPU a pass works on a vector of cells, on a GPU a group of threads has one cell.
 // ``Couplings`` is the struct of couplings.py.
 #pragma once
@@ -110,7 +110,7 @@ template <class Couplings> CUDA_CALLABLE inline void spread(const Couplings& c, 
     const Real* const world = (const Real*)c.moments.data + 3 * (size_t)at.first_moment;
     const Vector m = to_body(frame, vectors((const Real*)c.moments.data + 3 * (size_t)at.i, at.count));
     Number difference[3] = {m.x * 0, m.x * 0, m.x * 0};
-    for (int side = 0; side < 6; ++side) {
+    for (int side = 0; side < (c.has_slopes ? 6 : 0); ++side) {
         const int k = side / 2;
         const Neighbors other = neighbors_at(c, at, side);
         const Index place = 3 * other.j;
@@ -140,6 +140,7 @@ template <class Couplings> CUDA_CALLABLE inline Vector gathered(const Couplings&
         const Real* const field = c.fields.data + k * pitch + at.first_row;
         const Number own = numbers(c.fields.data + k * pitch + at.row);
         h[k] = own * 0;
+        if (!c.has_slopes) continue;
         for (int side = 2 * k; side < 2 * k + 2; ++side) {
             const Neighbors other = neighbors_at(c, at, side);
             const Number sum = other.outward * own + other.back * collect(field, other.j);

@@ -32,6 +32,7 @@ def couplings_type(dtype):
         tensor: wp.array[dtype]  # T_ij [1/m³], row after row, of CHUNK cells per slot; zero after a list's end
         side: wp.array2d[int]  # neighbor of each cell on the sides −x, +x, −y, ..., or the cell, shape [6, rows]
         weight: wp.array2d[dtype]  # weights in differences: of the cell's moment, of the neighbors', shape [12, rows]
+        has_slopes: int  # 1 if any weight is not 0
         # Model: bodies
         chunk: wp.array[wp.vec4i]  # first moment, count, first row of the body, first row of its table, shape [chunks]
         active: wp.array[int]  # on a GPU the number of chunks that are summed, then these; None for all
@@ -108,13 +109,14 @@ class CellCouplings:
         self.means, self.differences = c.means, c.differences
         self.difference_field = c.difference_field
         self.rotations, self.entries = c.rotation, sum(len(coupling.other) for _, coupling in bodies)
-        self._paired = paired
+        needed = {SPREAD: not paired, SHARE: bool(c.matrix.numpy().any()), TURN: bool(c.has_slopes), ADD: True}
+        self._passes = [number for number, is_needed in needed.items() if is_needed]
         self._record_all()
 
     def _record_all(self):
-        c, first = self._couplings, SHARE if self._paired else SPREAD
+        c = self._couplings
         self._spread = self._record(c, SPREAD, SPREAD)
-        ranges = [(k, k) for k in range(first, ADD + 1)] if c.h.device.is_cuda else [(first, ADD)]
+        ranges = [(k, k) for k in self._passes] if c.h.device.is_cuda else [(self._passes[0], ADD)]
         self._launches = [self._record(c, *ends) for ends in ranges]
 
     def sum_active(self, list_active):
@@ -165,6 +167,7 @@ class CellCouplings:
         c.matrix = put(np.concatenate([coupling.grid_common.ravel() for _, coupling in bodies]), dtype)
         c.common = wp.zeros(3 * len(bodies), dtype=dtype, device=device)
         c.side, c.weight = put(np.concatenate(sides, axis=1), wp.int32), put(np.concatenate(weights, axis=1), dtype)
+        c.has_slopes = int(any(part.any() for part in weights))
         c.body_moments = wp.zeros((3, CHUNK * len(chunks)), dtype=dtype, device=device)
         c.fields = wp.zeros((3, CHUNK * len(chunks)), dtype=dtype, device=device)
 

@@ -101,7 +101,10 @@ def _begin_kernel(dtype, group: int, blocks: int):
         chunk = state.chunk[block // wp.static(blocks)]
         moments_per_block = wp.block_dim() // wp.static(group)
         begin = chunk[0] + moments_per_block * (block % wp.static(blocks)) + lane // wp.static(group)
-        for row in range(begin, chunk[1], moments_per_block * wp.static(blocks)):
+        end = chunk[1]
+        if state.resting[chunk[2]] != 0:
+            end = chunk[0]
+        for row in range(begin, end, moments_per_block * wp.static(blocks)):
             start(state, row)
         if block == wp.static(blocks) * state.chunk_begin[chunk[2]] and lane == 0:
             begin_world(state, chunk[2])

@@ -8,6 +8,7 @@ and no moment comes near saturation, which cells reach one by one. A body change
 
 import warp as wp
 
+from warpmag.kernels.rigid.bodies import BodyMoments
 from warpmag.kernels.rigid.newton_views import body_pose
 
 wp.set_module_options({"enable_backward": False})
@@ -189,10 +190,18 @@ def _find_strengths(bodies: DistantBodies, choice: WorldChoice, few: SystemArray
 
 
 @wp.kernel
-def _spread_moments(bodies: DistantBodies, choice: WorldChoice, few: SystemArrays, many: SystemArrays):
+def _spread_moments(
+    body_q_in: wp.array[wp.transform],
+    magnets: BodyMoments,
+    bodies: DistantBodies,
+    choice: WorldChoice,
+    few: SystemArrays,
+    many: SystemArrays,
+):
     i = wp.tid()
     if choice.few_rest[bodies.moment_world[i]] != 0:
         return
+    many.positions[i] = wp.transform_point(body_pose(body_q_in, magnets.body[i]), magnets.local_positions[i])
     if bodies.source[i] >= 0:
         many.moments[i] = few.moments[bodies.source[i]]
         return
@@ -215,12 +224,20 @@ class DistantLaunches:
     Args:
         bodies: The bodies with few moments.
         choice: The choice of each world, which the launches write.
+        magnets: The moments of the system of cells on their bodies.
         many, few: The system of cells, and that of few moments.
     """
 
-    def __init__(self, bodies: DistantBodies, choice: WorldChoice, many: SystemArrays, few: SystemArrays):
+    def __init__(
+        self,
+        bodies: DistantBodies,
+        choice: WorldChoice,
+        magnets: BodyMoments,
+        many: SystemArrays,
+        few: SystemArrays,
+    ):
         """Record the launches that need no poses."""
-        self._bodies, self._choice, self._few = bodies, choice, few
+        self._bodies, self._choice, self._magnets, self._many, self._few = bodies, choice, magnets, many, few
         self._device, worlds = few.moments.device, len(choice.is_near)
 
         def record(kernel, dim, *inputs):
@@ -235,10 +252,7 @@ class DistantLaunches:
         self._finish_many = record(
             _find_saturated, len(many.moments), many, choice.many_rest, _LINEAR[0], choice.saturated
         )
-        self._spread = [
-            record(_find_strengths, bodies.strengths.shape, bodies, choice, few),
-            record(_spread_moments, len(many.moments), bodies, choice, few, many),
-        ]
+        self._find_strengths = record(_find_strengths, bodies.strengths.shape, bodies, choice, few)
 
     def choose(self, body_q, *, allowed: bool) -> None:
         """Choose the system of each world from the distances of moments to the bodies at the poses ``body_q``.
@@ -261,7 +275,11 @@ class DistantLaunches:
         """Mark the worlds where a cell is near saturation after a solve of the system of cells."""
         self._finish_many.launch()
 
-    def spread_moments(self) -> None:
-        """Write the moments of the system of cells where it rests: those of cells follow from the few moments."""
-        for launch in self._spread:
-            launch.launch()
+    def spread_moments(self, body_q) -> None:
+        """Write positions and moments of the system of cells where it rests, at the poses ``body_q``.
+
+        The moments of cells follow from the few moments.
+        """
+        self._find_strengths.launch()
+        inputs = [body_q, self._magnets, self._bodies, self._choice, self._few, self._many]
+        wp.launch(_spread_moments, len(self._many.moments), inputs=inputs, device=self._device)

@@ -63,9 +63,12 @@ class RestingWorlds:
         """Add the lists of targets of sources, of cells near permanent bodies, and of reactions."""
         worlds, arrays, sources = self._system.worlds, interaction.arrays, interaction.sources
         chunks, rows, of_source = arrays.targets.chunk, arrays.row, (*sources.applied, *sources.solids)
-        self._add(chunks, worlds[_column(chunks, 0)], _COUNT)
-        if interaction.cell_count:
-            self._add(arrays.cells.cell, worlds[_column(arrays.cells.cell, 0)], _BODIES)
+        if self._system.device.is_cuda:
+            interaction.list_active(self._list)
+        else:
+            self._add(chunks, worlds[_column(chunks, 0)], _COUNT)
+            if interaction.cell_count:
+                self._add(arrays.cells.cell, worlds[_column(arrays.cells.cell, 0)], _BODIES)
         self._add(rows, np.array([of_source[s].world for s in _column(rows, 0)], int), _ITEMS)
         self._add(interaction.movable, worlds, _ZERO)
 

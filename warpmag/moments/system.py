@@ -77,8 +77,8 @@ class MomentSystem:
             unless a world has several bodies of ``couplings``.
         resting: 1 for worlds that :meth:`solve` leaves out, with their moments as they are, shape [worlds]; only the
             dynamics ``theta`` has them. The caller may write it.
-        refresh: Function that launches the update of ``moments`` in worlds that rest, where other moments stand for
-            them; None without such moments.
+        refresh: Function that launches the update of ``positions`` and ``moments`` in worlds that rest, where other
+            moments stand for them; None without such moments.
         rotations: Rotation of each body of ``couplings`` from its frame to the world's (x, y, z, w), shape [bodies];
             written by the caller before :meth:`solve`. None without ``couplings``.
         sources: ``sources`` and ``solids`` on the device; the caller writes their poses and strengths before

@@ -96,8 +96,9 @@ class DistantMagnets:
         self._bodies = self._on_device(bodies, worlds)
         self._choice = self._make_choice(np.isin(np.arange(len(many.system.world_ranges)), worlds[list(bodies)]))
         few_arrays, many_arrays = (self._arrays(placed, bodies) for placed in (self.few, many))
-        self._launches = DistantLaunches(self._bodies, self._choice, many_arrays, few_arrays)
-        many.system.refresh = self._launches.spread_moments
+        self._launches = DistantLaunches(self._bodies, self._choice, many.table, many_arrays, few_arrays)
+        self._poses = wp.zeros(model.body_count, dtype=wp.transform, device=model.device)  # of the last solve
+        many.system.refresh = self._refresh
         self._resting = RestingWorlds(many.system) if len(many.system.world_ranges) > 1 else None
 
     @property
@@ -148,7 +149,7 @@ class DistantMagnets:
             count = len(magnet.lattice.volumes)
             if k in bodies:
                 cell[own] = np.stack([np.full(count, number[k]), np.arange(count)], axis=1)
-            elif not magnet.magnet.fixed:
+            else:
                 source[own] = first[k] + np.arange(count)
         coupled = [k for k, magnet in enumerate(many.magnets) if magnet.lattice.coupling is not None]
         arrays.rotation = put(np.searchsorted(coupled, indices), wp.int32)
@@ -174,25 +175,33 @@ class DistantMagnets:
         arrays.replaced = self._put(np.where(replaced, system.worlds, -1), wp.int32)
         return arrays
 
-    def solve(self, body_q: wp.array, values: ModelValues, *, allowed: bool = True) -> None:
-        """Launch the solve at the poses ``body_q``, to which the other system has been brought already.
-
-        With ``allowed`` False the system with cells is solved in all worlds.
-        """
-        few, choice = self.few.system, self._choice
+    def gather(self, body_q: wp.array, values: ModelValues) -> None:
+        """Write positions, rotations and permanent moments at the poses ``body_q`` to the system with few moments."""
+        if len(self._poses):
+            wp.copy(self._poses, body_q)
         self.few.gather(body_q, values)
-        self._launches.choose(body_q, allowed=allowed)
+
+    def solve(self, values: ModelValues, *, allowed: bool = True) -> None:
+        """Launch the solve; with ``allowed`` False that of the system with cells in all worlds."""
+        few, choice = self.few.system, self._choice
+        self._launches.choose(self._poses, allowed=allowed)
         wp.capture_if(choice.any_few_begin, partial(few.start_cold, choice.few_begin))
         wp.capture_if(choice.any_few, few.solve)
         self._launches.finish_few()
         wp.capture_if(choice.any_many_begin, partial(self._many.system.start_cold, choice.many_begin))
-        wp.capture_if(choice.any_many, self._solve_many)
+        wp.capture_if(choice.any_many, partial(self._solve_many, values))
 
-    def _solve_many(self) -> None:
+    def _solve_many(self, values: ModelValues) -> None:
+        self._many.gather(self._poses, values)
         if self._resting is not None:  # a single world rests as a whole
             self._resting.leave_out()
         self._many.system.solve()
         self._launches.finish_many()
+
+    def _refresh(self) -> None:
+        """Write positions and moments of the system with cells where it rests."""
+        self._many.gather_frames(self._poses)
+        self._launches.spread_moments(self._poses)
 
     def add_forces(self, state: newton.State) -> None:
         """Launch the forces of the last solve, and add them to ``state.body_f``."""
@@ -207,6 +216,7 @@ class DistantMagnets:
         """Return the arrays that the next solve and :meth:`add_forces` read, by name."""
         choice = self._choice
         own = {name: getattr(choice, name) for name in ("saturated", "any_many", "any_few")}
+        own["poses"] = self._poses
         return self.few.system.persistent_arrays() | own
 
     def evaluate_again(self) -> None:

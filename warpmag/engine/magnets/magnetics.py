@@ -62,8 +62,8 @@ class Magnetics:
 
     Attributes:
         magnets: The magnets, in the order of their moments.
-        system: The moments on the device. Where bodies act by few moments, call its ``refresh`` before its ``moments``
-            are read; measurements of fields and :meth:`sum_moments` do so.
+        system: The moments on the device. Where bodies act by few moments, call its ``refresh`` before its
+            ``positions`` and ``moments`` are read; measurements of fields and :meth:`sum_moments` do so.
         shapes: Indices of the magnetic shapes, in the order of :meth:`shape_moments`, shape [n].
         shape_volumes: Magnetic volume of each of these shapes [m³], shape [n]. Where shapes of one body overlap, the
             common volume belongs to the first of them.
@@ -296,12 +296,12 @@ class Magnetics:
         self._check_state(state, "body_q")
         check_untaped(self._gradients.arguments(state), "only Magnetics.apply records one")
         self._induced = True
-        self._placed.gather(state.body_q, values)
+        (self._distant or self._placed).gather(state.body_q, values)
         values.check(wait=False)
         self._sources.gather(state.body_q)
         gather_velocities(self._model, state, self._placed.table, self._sources, system)
         if self._distant is not None:
-            self._distant.solve(state.body_q, values, allowed=not taped)
+            self._distant.solve(values, allowed=not taped)
         elif self.coils is None or dt is None:
             system.solve()
         else:

@@ -73,12 +73,17 @@ class PlacedMoments:
         """Write positions, rotations and permanent moments at the poses ``body_q`` to the system."""
         system, table = self.system, self.table
         gather_moments(body_q, table, values.present, values.used, system.positions, system.moments, values.changed)
+        self.gather_frames(body_q)
+        if len(self.recoiling):
+            gather_bias(body_q, table, self.recoiling, self._bias_factors, system.bias)
+
+    def gather_frames(self, body_q: wp.array) -> None:
+        """Write rotations of bodies of cells and frames of permanent bodies at the poses ``body_q`` to the system."""
+        system = self.system
         if system.rotations is not None:
             gather_rotations(body_q, self.coupled_bodies, system.rotations)
         if len(self._solid_bodies):
             gather_frames(body_q, self._solid_bodies, system.sources.solid_frames)
-        if len(self.recoiling):
-            gather_bias(body_q, table, self.recoiling, self._bias_factors, system.bias)
 
     def add_wrenches(self, model: newton.Model, state: newton.State) -> None:
         """Add the forces that the system computed to ``state.body_f``, but not in worlds where it rests."""
