@@ -7,8 +7,8 @@
 // energy −½ μ0 φᵀ R φ. Python computes R (``warpmag.shapes.face_charges``); it leaves out uniform charges.
 //
 // Both fade with the distance of a cell from the body, in longest sides of the cell. Forces are the derivatives of the
-// energy. Takes CELL_REACH_LOW, CELL_REACH_HIGH, STEEP_REACH_LOW and STEEP_REACH_HIGH from Python. ``Arrays`` is the
-// struct of sources.py.
+// energy at constant permeability of the cell. Takes CELL_REACH_LOW, CELL_REACH_HIGH, STEEP_REACH_LOW and
+// STEEP_REACH_HIGH from Python. ``Arrays`` is the struct of sources.py.
 #pragma once
 #include "applied/target_field.h"
 

@@ -2,9 +2,9 @@
 //
 // The tensor of close boxes is the field of the larger box, averaged over 2³ Gauss points of the smaller one. One of a
 // pair may be a ball: a ball's field is a closed form, too, and the average over a ball is the value at its center.
-// Those farther away differ from balls by their quadrupoles. A window ends this difference. Forces are the exact
-// derivatives of the energy −μ0 m_i·T_ij·m_j, so that they conserve energy and momentum. Lengths are in units of the
-// mean of the boxes' sizes.
+// Boxes farther apart differ from balls by their quadrupoles. A window function ends this difference. Forces are the
+// exact derivatives of the energy −μ0 m_i·T_ij·m_j, so that they conserve energy and momentum. Lengths are in units of
+// the mean of the boxes' sizes.
 //
 // From Python: WINDOW_BEGIN, WINDOW_END, CLOSE_BEGIN and CLOSE_END, distances of the windows.
 #pragma once

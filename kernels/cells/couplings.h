@@ -1,9 +1,10 @@
 // Cells of one body: the differences of their halves, and corrections of the field between them, H_i += Σ T_ij m_j.
 //
-// SPREAD writes moments and half the difference D m of the halves of each cell (``warpmag.shapes.linear_cells``). SHARE
-// computes the field that all cells of a body share. TURN copies the fields of the differences by rows. ADD adds Dᵀ of
-// them, the tensors' fields, and the shared field. Where no cell has slopes, the differences are 0. Everything is in the
-// frame of the body's grid. On a CPU a pass works on a vector of cells, on a GPU a group of threads has one cell.
+// SPREAD writes the moment of each cell and half the difference D m of its halves (``warpmag.shapes.linear_cells``).
+// SHARE computes the uniform field that the correction C adds to all cells of a body. TURN copies the fields of the
+// differences from an array of vectors to rows of components. ADD adds Dᵀ of these fields, the fields of the tensors,
+// and the uniform field. Where no cell has slopes, the differences are 0. Everything is in the frame of the body's
+// grid. On a CPU a pass works on a vector of cells, on a GPU a group of threads has one cell.
 // ``Couplings`` is the struct of couplings.py.
 #pragma once
 #include "cells/rotation.h"

@@ -1,24 +1,27 @@
 """Cells whose magnetization varies along its own axes: differences between their halves, and the operator of a body.
 
 Iron of high permeability has charges on its surface and almost none inside. Uniform cells have charges on the faces
-between them wherever the magnetization varies. They cost energy, and the body responds too little: two letters in
-contact attract each other 20 % too weakly. So a component of the magnetization has a slope along its own axis, from
-the neighbors on both sides. Where div M = 0 the charges in a cell then cancel, and faces have almost none.
+between them wherever the magnetization varies. These charges cost energy, and the body responds too little: two
+letters in contact attract each other 20 % too weakly. So each component of the magnetization has a slope along its own
+axis, from the neighbors on both sides. Where div M = 0 the charges in a cell then cancel, and faces have almost none.
 
 The unknowns stay one vector M per cell, the mean. Along axis k the halves of a cell have the means M ± D M, with
 
-    D M = ¼ Σ_s s w_s (M_s − M),    s = ±1,    w_s = ½ min(V_s/V, V/V_s) a a_s,    a = min(1, V_whole/V),
+    D M = ¼ Σ_s s w_s (M_s − M),    s = ±1,    w_s = ½ min(V_s/V, V/V_s) b b_s,    b = min(1, V_grid/V),
 
-where M_s is the neighbor on the side s; w_s = 0 where there is none. Cells that the surface cuts, or that are several
-pieces, so have smaller slopes than whole cells. Without that, their operator is not positive. The field that magnetizes
-a cell is the derivative of the energy: the mean field, plus Dᵀ of half the difference G of the fields of the halves.
-Halves lack the linear part within a half, whose field is H = −M as in a plate. Its energy per volume, μ0 D²/6, is
-subtracted.
+where V is the volume of the cell, V_grid that of a whole cell of the grid, and M_s, V_s, b_s belong to the neighbor on
+the side s. Without a neighbor w_s is 0. V exceeds V_grid where a cell includes pieces of its neighbors. The factors
+reduce the slopes of cells that differ in volume from their neighbors or from V_grid. With the full slopes of such cells
+the operator is not positive. The field that magnetizes a cell is the derivative of the energy: the mean field, plus Dᵀ
+of half the difference of the fields of the halves.
+
+The halves are uniform, but the magnetization they represent is linear. The difference of the two is a sawtooth, whose
+field is H = −M as in a plate. Its energy per volume, μ0 (D M)²/6, remains where div M = 0. So it is subtracted.
 
 Magnetizations without charges have no energy. In iron they do not occur, because M follows the curl-free field H. But
 conjugate gradients need many steps for them, and errors of distant pairs of cells would make their energy negative. So
-the curl of M at the edges between cells gets a small one, :data:`_CURL` μ0 (a curl M)²/2 per volume, where a is the
-geometric mean of the sides of a cell across the edge.
+the curl of M at the edges between cells has a small energy, :data:`_CURL` μ0 (l curl M)²/2 per volume, where l is the
+geometric mean of the sides of a cell perpendicular to the edge.
 """
 
 from dataclasses import replace

@@ -9,7 +9,8 @@ gradients if there are many.
 
 Let P be the polarizability of the cells and Q that of the surface. The correction adds a uniform field of C = P⁻¹ − Q⁻¹
 times the moment of the body to all cells. By Woodbury's formula the response to a uniform field becomes Q. Because Q is
-positive, the operator stays positive. A change of the cells' own tensors would not ensure that.
+positive, the operator stays positive. A change of the cells' own tensors would not ensure that. In a world with n
+bodies of cells the correction of each is C/n (:meth:`Coupling.among`), so the response is Q only for n = 1.
 """
 
 from collections.abc import Sequence
