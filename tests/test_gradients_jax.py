@@ -13,6 +13,7 @@ from jax.test_util import check_grads  # noqa: E402
 
 import warpmag  # noqa: E402
 import warpmag.jax  # noqa: E402
+from bench.gradients import field_gradients  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
@@ -110,3 +111,14 @@ def test_on_a_tape_of_warp(place):
     with wp.Tape() as tape:
         gradient = jax.grad(force)(x).block_until_ready()
     assert np.array_equal(gradient, expected) and not tape.launches
+
+
+def test_gradients_are_those_of_magpylib_jax(device):
+    """Field of 40 permanent dipoles at other points, by positions, moments and points."""
+    peer_module = pytest.importorskip("bench.peers.with_magpylib_jax", reason="magpylib-jax is not installed")
+    arrays = np.random.default_rng(2).uniform(-1.0, 1.0, (4, 40, 3))
+    peer = peer_module.field_gradients(*arrays)
+    peer.run()
+    peer.wait()
+    for own, other in zip(field_gradients(*arrays, device=device), peer.result(), strict=True):
+        assert np.allclose(own, other, rtol=0.0, atol=1e-12 * np.abs(other).max())  # sums of 40 terms in float64

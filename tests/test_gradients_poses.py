@@ -14,7 +14,7 @@ FIELD = (2e4, 0.0, 5e4)
 MAGNETIZATION = (0.0, 3e5, 8e5)
 
 
-def model_of_balls(worlds=1, **settings):
+def model_of_balls(device, worlds=1, **settings):
     """Two iron balls, a magnet that hangs off its body's center, and a pair of magnets on one body, in each world."""
     builder = world = new_builder()
     add_ball(builder, (0.0, 0.0, 0.0))
@@ -28,7 +28,7 @@ def model_of_balls(worlds=1, **settings):
     if worlds > 1:
         builder = new_builder()
         builder.replicate(world, worlds)
-    model = builder.finalize(device="cpu", requires_grad=True)
+    model = builder.finalize(device=device, requires_grad=True)
     return model, warpmag.Magnetics(model, external_field=FIELD, rtol=1e-5, **settings)
 
 
@@ -48,12 +48,12 @@ def body_forces(poses, com):
     material = warpmag.declarations.magnets.Magnet(kind="inducible")
     balls = warpmag.solve_induction(
         x[:2], R, saturation=material.saturation, susceptibility=material.susceptibility, external_field=FIELD,
-        permanent=(x[2:], m), rtol=1e-12, dtype="float64",
+        permanent=(x[2:], m), rtol=1e-12, dtype="float64", device="cpu",
     )  # fmt: skip
     m = np.concatenate([volume * balls.magnetizations, m])
-    forces, torques = warpmag.wrench(x, m, radii=R, external_field=FIELD, dtype="float64")
+    forces, torques = warpmag.wrench(x, m, radii=R, external_field=FIELD, dtype="float64", device="cpu")
     # magnets of one body exert no forces on each other
-    own_forces, own_torques = warpmag.wrench(x[3:], m[3:], radii=R, dtype="float64")
+    own_forces, own_torques = warpmag.wrench(x[3:], m[3:], radii=R, dtype="float64", device="cpu")
     forces[3:] -= own_forces
     torques[3:] -= own_torques
     torques[:2] = 0.0
@@ -64,8 +64,8 @@ def body_forces(poses, com):
     return total
 
 
-def test_poses():
-    model, magnetics = model_of_balls()
+def test_poses(device):
+    model, magnetics = model_of_balls(device)
     state = model.state()
     with wp.Tape() as tape:
         magnetics.apply(state)
@@ -95,13 +95,13 @@ def gradient_of(model, magnetics, poses, seed):
     return state.body_q.grad.numpy()
 
 
-def test_worlds():
-    rng, (single, magnetics) = np.random.default_rng(3), model_of_balls()
+def test_worlds(device):
+    rng, (single, magnetics) = np.random.default_rng(3), model_of_balls(device)
     poses = np.concatenate([single.body_q.numpy()] * 2)
     poses[:, :3] += 1e-3 * rng.uniform(-0.5, 0.5, (8, 3))
     seed = rng.normal(size=(8, 6))
     expected = [gradient_of(single, magnetics, poses[rows], seed[rows]) for rows in (slice(0, 4), slice(4, 8))]
-    together = gradient_of(*model_of_balls(worlds=2), poses, seed)
+    together = gradient_of(*model_of_balls(device, worlds=2), poses, seed)
     # rtol of both solves is 1e-5, and the second linear solve of one model starts from the first one's solution
     np.testing.assert_allclose(together, np.concatenate(expected), rtol=0.0, atol=1e-4 * np.abs(together).max())
 
@@ -124,19 +124,19 @@ def advance(
     body_q_out[i] = wp.transform(x, wp.transform_get_rotation(body_q[i]))
 
 
-def test_a_rollout():
+def test_a_rollout(device):
     """A hundred substeps in which three iron balls attract each other, against the same rollout in float64."""
     builder, dt, steps = new_builder(), 5e-5, 100
     for position in ((0.0, 0.0, 0.0), (0.001, 0.0125, 0.002), (-0.002, 0.004, 0.0135)):
         add_ball(builder, position)
-    model = builder.finalize(device="cpu", requires_grad=True)
+    model = builder.finalize(device=device, requires_grad=True)
     magnetics = warpmag.Magnetics(model, external_field=FIELD, rtol=5e-6)
     states = [model.state() for _ in range(steps + 1)]
     with wp.Tape() as tape:
         for now, after in itertools.pairwise(states):
             magnetics.apply(now)
             inputs = [dt, model.body_inv_mass, now.body_f, now.body_q, now.body_qd]
-            wp.launch(advance, 3, inputs=inputs, outputs=[after.body_q, after.body_qd], device="cpu")
+            wp.launch(advance, 3, inputs=inputs, outputs=[after.body_q, after.body_qd], device=device)
     seed = np.random.default_rng(7).normal(size=(3, 3))
     states[-1].body_q.grad.assign(np.pad(seed, ((0, 0), (0, 4))))
     tape.backward()
@@ -148,7 +148,7 @@ def test_a_rollout():
         for _ in range(steps):
             balls = warpmag.solve_induction(
                 x, R, saturation=material.saturation, susceptibility=material.susceptibility, external_field=FIELD,
-                rtol=1e-10, dtype="float64",
+                rtol=1e-10, dtype="float64", device="cpu",
             )  # fmt: skip
             v = v + dt * inv_mass * balls.wrench()[0]
             x = x + dt * v
@@ -168,7 +168,7 @@ def test_a_rollout():
 
 
 def test_what_has_no_gradient_raises():
-    model, magnetics = model_of_balls(force="zeeman")
+    model, magnetics = model_of_balls("cpu", force="zeeman")
     with (
         wp.Tape(),
         pytest.raises(warpmag.InputError, match=r"state.body_q: .* the force 'zeeman' has none"),
