@@ -62,7 +62,7 @@ def pair_correction(a, b, window, close) -> np.ndarray:
 
     Args:
         a, b: Boxes: position [m], rotation matrix, half sides [m].
-        window, close: Windows of all boxes, in mean sizes, and of boxes integrated over, in mean longest sides.
+        window, close: Windows of all boxes and of boxes integrated over, in means of their sizes.
     """
     (x, turn, half), (y, other_turn, other_half) = a, b
     r, d = x - y, np.linalg.norm(x - y)
@@ -79,7 +79,7 @@ def pair_correction(a, b, window, close) -> np.ndarray:
     spread = turn @ np.diag(half**2 / 3.0) @ turn.T + other_turn @ np.diag(other_half**2 / 3.0) @ other_turn.T
     g1, g2, _ = oracle.radial_factors(np.array([d]), radii[0], radii[1])
     ball = (g1[0] * np.eye(3) + g2[0] * np.outer(r, r)) / (4.0 * np.pi)
-    near = fade(d / (half.max() + other_half.max()), close)
+    near = fade(distance, close)
     tensor = near * (of_larger - ball) + (1.0 - near) * quadrupole_tensor(r, spread)
     return fade(distance, window) * tensor
 

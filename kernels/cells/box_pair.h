@@ -59,11 +59,10 @@ struct BoxPair {
 CUDA_CALLABLE inline Number longest(Vector half) { return larger(half.x, larger(half.y, half.z)); }
 CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, const RelativePose& pose, Mask listed,
                                       Mask own_first) {
-    const Number unit = 2 / (own.size + other.size), side = unit * (longest(own.half) + longest(other.half));
+    const Number unit = 2 / (own.size + other.size);
     const Vector r = unit * pose.r;
     const Number d = length(r);
-    Window close = window_between(d / side, CLOSE_BEGIN, CLOSE_END, listed);
-    close.slope /= side;
+    Window close = window_between(d, CLOSE_BEGIN, CLOSE_END, listed);
     const Mask own_smaller = own.volume < SMALLER * other.volume, alike = own.volume * SMALLER <= other.volume;
     const Mask own_points = own_smaller | (own_first & alike);
     return {unit * own.half,

@@ -29,7 +29,8 @@ _FLATTEST = 3.0
 """Largest ratio of sides that increases a size, that of whole cells at automatic spacing. Flatter cells are parts that
 a surface cuts off, of little volume."""
 CLOSE = 1.75, 2.25
-"""Distances at which the average over close boxes turns into their quadrupoles, in means of their longest sides."""
+"""Distances at which the average over close boxes turns into their quadrupoles, in means of their sizes, too. In means
+of their longest sides the operator of a stack of five sheets would have an eigenvalue of -0.0025."""
 HARDENING = 0.45
 """Demagnetizing factor added to a cell inside another body. Quadrature over intersecting boxes leaves eigenvalues of
 -0.05."""
