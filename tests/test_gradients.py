@@ -105,6 +105,7 @@ CASES = {
     "overlapping": {"overlap": True, "seeds": (1.0, 1.0, 1e6, 1e8)},
     "saturated": {"field": 2e6},
     "curves": {"curve": ["tanh", "langevin", "frohlich"] * 7 + ["1010-steel", "tanh"]},
+    "points": {"curve": None, "field": 1.3e5},
 }
 """Deviations from the defaults of :func:`test_equilibrium`."""
 
@@ -128,13 +129,18 @@ def test_equilibrium(case, device):
         arguments["radii"] = radii
     if case["curve"] != "tanh":
         del arguments["saturation"], arguments["susceptibility"]
+    if case["curve"] is None:
+        arguments |= {
+            "fields": np.array([2e3, 7e3, 2e4, 5e4]), "magnetizations": np.array([1e5, 2e5, 2.6e5, 3e5]),
+        }  # fmt: skip
 
-    def function(positions, magnet_positions, magnet_moments, radii=radii, **options):
-        if case["curve"] != "tanh":
-            options |= {"saturation": np.full(count, 5e5), "susceptibility": 20.0}
+    def function(positions, magnet_positions, magnet_moments, radii=radii, fields=None, magnetizations=None, **options):
+        if case["curve"] is None:
+            options["curve_points"] = fields, magnetizations
+        elif case["curve"] != "tanh":
+            options |= {"saturation": np.full(count, 5e5), "susceptibility": 20.0, "curve": case["curve"]}
         result = warpmag.solve_induction(
-            positions, radii, permanent=(magnet_positions, magnet_moments), curve=case["curve"], rtol=1e-13,
-            dtype="float64", **options,
+            positions, radii, permanent=(magnet_positions, magnet_moments), rtol=1e-13, dtype="float64", **options,
         )  # fmt: skip
         return [result.magnetizations, result.h_field, *result.wrench()]
 
@@ -200,6 +206,7 @@ def test_what_has_no_gradient_raises(device):
         "positions: .*'llg' has none": lambda: solve(dynamics="llg"),
         "positions: .*'multipole' has none": lambda: solve(contact_model="multipole"),
         "radii: .*overlapping": lambda: solve(radii=warp_array(3.0 * radii, device)),
+        "curve: fields require a gradient": lambda: warpmag.MagnetizationCurve.from_mh(size, radii),
         "positions: .*'zeeman' has none": lambda: solve().wrench("zeeman"),
         "positions: an indexed array": lambda: warpmag.h_field(
             wp.indexedarray1d(positions, [wp.array(np.arange(len(x)), dtype=int, device=device)]), m, **options

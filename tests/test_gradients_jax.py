@@ -73,6 +73,19 @@ def test_equilibrium(place):
     check(solve, (noise, radii, jnp.float64(2.0), jnp.float64(30.0), field, dipoles, dipole_moments))
 
 
+def test_points_of_a_curve(place):
+    positions = jnp.array([[0.0, 0.0, 0.0], [0.0, 0.3, 0.9]])
+
+    def solve(fields, magnetizations):
+        result = warpmag.jax.solve_induction(
+            positions, 0.3, curve_points=(fields, magnetizations), external_field=(0.0, 0.0, 3.0), rtol=1e-12,
+            device=place,
+        )  # fmt: skip
+        return result.magnetizations, 1e6 * result.wrench()[0]
+
+    check(solve, (jnp.array([0.5, 1.0, 3.0]), jnp.array([2.0, 4.0, 5.0])))
+
+
 def test_what_has_no_gradient_raises(place):
     x, m = arrays((3, 3), (3, 3))
     with pytest.raises(Exception, match="radii: requires a gradient"):

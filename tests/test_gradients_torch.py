@@ -79,6 +79,20 @@ def test_measured_curves_and_precision(device):
     assert x.grad[1, 2] < 0.0  # the attraction decreases with the distance
 
 
+def test_points_of_a_curve(device):
+    x, points = tensors(device, (2, 3), (2, 3))
+    offset = torch.tensor([[0.5, 1.0, 3.0], [2.0, 4.0, 5.0]], dtype=x.dtype, device=x.device)
+
+    def solve(points):
+        fields, magnetizations = offset + 0.1 * points
+        return warpmag.torch.solve_induction(
+            x.detach() + torch.arange(2.0, device=x.device)[:, None], 0.2, curve_points=(fields, magnetizations),
+            external_field=(0.0, 0.0, 3.0), rtol=1e-12,
+        ).magnetizations  # fmt: skip
+
+    assert gradcheck(solve, (points,))
+
+
 def test_what_has_no_gradient_raises(device):
     x, m = tensors(device, (3, 3), (3, 3))
     radii = torch.full((3,), 0.1, dtype=torch.float64, requires_grad=True)

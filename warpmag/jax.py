@@ -40,10 +40,10 @@ from warpmag.moments.arrays import DTYPES, dtype_name, real_array, resolve_devic
 from warpmag.moments.tape import paused_tape
 
 _POSITIONAL = inspect.Parameter.POSITIONAL_OR_KEYWORD
-_SCALARS = ("radii", "target_radii", "saturation", "susceptibility")
-"""Arguments of one number for each ball; the others are vectors."""
-_PLACES = ("positions", "targets", "dipoles")
-"""Arguments whose number of vectors other arguments follow."""
+_SCALARS = ("radii", "target_radii", "saturation", "susceptibility", "curve_fields", "curve_magnetizations")
+"""Arguments of one number for each ball or point of a curve; the others are vectors."""
+_PLACES = ("positions", "targets", "dipoles", "curve_fields")
+"""Arguments whose number of entries other arguments follow."""
 
 
 def h_field(positions, moments, targets=None, *, radii=None, target_radii=None, method="auto", rtol=None, device=None):
@@ -102,8 +102,8 @@ class InductionArrays:
 
 
 def solve_induction(
-    positions, radii, *, saturation=None, susceptibility=math.inf, curve="tanh", external_field=None, permanent=None,
-    method="auto", rtol=1e-3, max_evaluations=1000, device=None,
+    positions, radii, *, saturation=None, susceptibility=math.inf, curve="tanh", curve_points=None,
+    external_field=None, permanent=None, method="auto", rtol=1e-3, max_evaluations=1000, device=None,
 ) -> InductionArrays:  # fmt: skip
     """Return the magnetic equilibrium of inducible balls; see :func:`warpmag.solve_induction`.
 
@@ -114,7 +114,8 @@ def solve_induction(
     arrays |= {"external_field": external_field, "dipoles": dipoles, "dipole_moments": dipole_moments}
     if saturation is None:  # of measured curves
         del arrays["susceptibility"]
-    arrays = _read(arrays, {"dipole_moments": "dipoles"}, "radii")
+    arrays["curve_fields"], arrays["curve_magnetizations"] = induction.pair_of("curve_points", curve_points)
+    arrays = _read(arrays, {"dipole_moments": "dipoles", "curve_magnetizations": "curve_fields"}, "radii")
     curve = tuple(curve) if isinstance(curve, list) else curve
     options = {"curve": curve, "method": method, "rtol": rtol, "max_evaluations": max_evaluations}
     m, h = _differentiable(_call("solve_induction", options, device), arrays)
@@ -181,6 +182,8 @@ class _Call:
             return list(fields.wrench(**arrays, **options))
         arrays = dict(arrays)
         permanent = [arrays.pop(name, np.zeros((0, 3))) for name in ("dipoles", "dipole_moments")]
+        if "curve_fields" in arrays:
+            options["curve_points"] = arrays.pop("curve_fields"), arrays.pop("curve_magnetizations")
         result = induction.solve_induction(permanent=permanent, **arrays, **options)
         return [result.magnetizations, result.h_field]
 

@@ -97,8 +97,8 @@ class InductionTensors:
 
 
 def solve_induction(
-    positions, radii, *, saturation=None, susceptibility=math.inf, curve="tanh", external_field=None, permanent=None,
-    method="auto", rtol=1e-3, max_evaluations=1000, initial=None,
+    positions, radii, *, saturation=None, susceptibility=math.inf, curve="tanh", curve_points=None,
+    external_field=None, permanent=None, method="auto", rtol=1e-3, max_evaluations=1000, initial=None,
 ) -> InductionTensors:  # fmt: skip
     """Return the magnetic equilibrium of inducible balls; see :func:`warpmag.solve_induction`.
 
@@ -110,17 +110,20 @@ def solve_induction(
     tensors |= {"external_field": external_field, "dipoles": dipoles, "dipole_moments": dipole_moments}
     if saturation is None:  # of measured curves
         del tensors["susceptibility"]
+    tensors["curve_fields"], tensors["curve_magnetizations"] = induction.pair_of("curve_points", curve_points)
     solved = []
 
-    def call(dtype, dipoles, dipole_moments, **arrays):
+    def call(dtype, dipoles, dipole_moments, curve_fields=None, curve_magnetizations=None, **arrays):
+        points = None if curve_fields is None else (curve_fields, curve_magnetizations)
         result = induction.solve_induction(
-            permanent=(dipoles, dipole_moments), curve=curve, method=method, rtol=rtol,
+            permanent=(dipoles, dipole_moments), curve=curve, curve_points=points, method=method, rtol=rtol,
             max_evaluations=max_evaluations, initial=initial, dtype=dtype, **arrays,
         )  # fmt: skip
         solved.append(result)
         return [result.magnetizations, result.h_field]
 
-    m, h = _recorded(call, tensors, {"dipole_moments": "dipoles"}, "radii")
+    owners = {"dipole_moments": "dipoles", "curve_magnetizations": "curve_fields"}
+    m, h = _recorded(call, tensors, owners, "radii")
     inputs = {
         "positions": positions,
         "radii": radii,
@@ -130,10 +133,10 @@ def solve_induction(
     return InductionTensors(m, h, solved[0].error, solved[0].evaluations, solved[0].converged, inputs)
 
 
-_SCALARS = ("radii", "target_radii", "saturation", "susceptibility")
-"""Arguments of one number for each ball; the others are vectors."""
-_PLACES = ("positions", "targets", "dipoles")
-"""Arguments whose number of vectors other arguments follow."""
+_SCALARS = ("radii", "target_radii", "saturation", "susceptibility", "curve_fields", "curve_magnetizations")
+"""Arguments of one number for each ball or point of a curve; the others are vectors."""
+_PLACES = ("positions", "targets", "dipoles", "curve_fields")
+"""Arguments whose number of entries other arguments follow."""
 
 
 def _filled(name: str, value, like, count: int | None):

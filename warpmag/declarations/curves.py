@@ -172,6 +172,8 @@ def _slopes(h, m):
 
 def _numbers(name: str, quantity: str, values) -> np.ndarray:
     """Return values as a one-dimensional array of finite numbers."""
+    if getattr(values, "requires_grad", False):
+        raise InputError(f"{name}: {quantity} require a gradient, which only curve_points of solve_induction have")
     try:
         array = np.asarray(None if isinstance(values, BYTES) else plain_value(f"{name}: {quantity}", values))
         if array.dtype.kind not in "iuf":

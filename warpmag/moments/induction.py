@@ -27,7 +27,7 @@ from warpmag.moments.arrays import (
     real_array,
     resolve_context,
 )
-from warpmag.moments.induction_gradients import BallGradients
+from warpmag.moments.induction_gradients import POINT_ARRAYS, BallGradients
 from warpmag.moments.layout import MomentMaterial
 from warpmag.moments.ranks import compare_arguments
 from warpmag.moments.settings import SolverSettings
@@ -69,6 +69,7 @@ class InductionResult:
     _context: CallContext = field(repr=False)
     _arguments: dict = field(repr=False)
     _balls: "_Balls" = field(repr=False)
+    _curve: Any = field(repr=False)  # as the argument, or the measured curve of its points
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the fields without those on the device, for pickle and copy."""
@@ -128,12 +129,14 @@ class InductionResult:
         system = self._system
         assert system is not None
         system.gradients.load(system.positions, system.moments, system.h, system.external_field)
-        return BallGradients(system.gradients, system.radii, self._balls.count)
+        point_count = len(self._arguments.get(POINT_ARRAYS[0], ()))
+        return BallGradients(system.gradients, system.radii, self._balls.count, self._curve, point_count)
 
     def _record_wrench(self, tape: wp.Tape, force: str, forces, torques) -> None:
         """Record the gradients of forces and torques on a tape."""
         settings, arguments = self._system.settings, {**self._arguments, "magnetizations": self.magnetizations}
-        del arguments["saturation"], arguments["susceptibility"]  # they act through the magnetizations
+        for name in ("saturation", "susceptibility", *POINT_ARRAYS):  # they act through the magnetizations
+            arguments.pop(name, None)
         _check_differentiable(settings, arguments)
         self._check_overlaps()
         if force != "kelvin":
@@ -155,6 +158,7 @@ def solve_induction(
     saturation: Numbers | None = None,
     susceptibility: Numbers = math.inf,
     curve: str | MagnetizationCurve | Sequence[str | MagnetizationCurve] = "tanh",
+    curve_points: tuple[Numbers, Numbers] | None = None,
     external_field: Numbers | None = None,
     permanent: tuple[Numbers, Numbers] | None = None,
     dynamics: str = "theta",
@@ -173,7 +177,7 @@ def solve_induction(
     arrangement.
 
     Warp arrays with ``requires_grad`` are differentiated on an active ``wp.Tape``: positions, radii, saturation,
-    susceptibility, external field and permanent moments with their positions.
+    susceptibility, points of a curve, external field and permanent moments with their positions.
 
     Args:
         positions: Ball centers [m], shape [n, 3], NumPy or Warp.
@@ -183,6 +187,8 @@ def solve_induction(
         curve: Magnetization curve: one of ``magnets.CURVES``, a measured :class:`warpmag.MagnetizationCurve`, or the
             name of a material with a measured curve. Measured curves have their own saturation and susceptibility. A
             tuple or list of n gives each ball its own curve.
+        curve_points: Points of a measured curve of all balls in place of ``curve``: (fields H inside [A/m],
+            magnetizations M [A/m]), each of shape [points], as :meth:`warpmag.MagnetizationCurve.from_mh`.
         external_field: Applied field H0 [A/m], shape [3] or [n, 3].
         permanent: Permanent point dipoles as (positions [m], moments [A·m²]), each of shape [k, 3].
         dynamics: ``theta``: accelerated exact flow of Eqs. 8 and 9. ``theta-euler``: their explicit step. ``llg``,
@@ -231,12 +237,15 @@ def solve_induction(
         balls = _read_balls(context, positions, radii, external_field, permanent)
         if permanent is not None:
             arguments["permanent: positions"], arguments["permanent: moments"] = permanent
+        if curve_points is not None:
+            curve, points = _read_points(curve, curve_points)
+            arguments |= points
         if tape is not None:
             _check_differentiable(settings, arguments)
         material = _read_material(balls.count, saturation, susceptibility, curve)
         system = balls.make_system(context, material, settings, initial)
         system.solve()
-        result = _read_result(context, system, balls, arguments, initial)
+        result = _read_result(context, system, balls, arguments, initial, curve)
         if tape is not None and balls.count:
             result._record(tape)
     return result
@@ -289,12 +298,27 @@ class _Balls:
 
 def permanent_dipoles(permanent) -> tuple[Any, Any]:
     """Return positions and moments of the argument ``permanent``, of no dipoles if it is None."""
-    if permanent is None:
-        return np.zeros((0, 3)), np.zeros((0, 3))
-    if not isinstance(permanent, (tuple, list)) or len(permanent) != 2:
-        raise InputError(f"permanent: must be (positions, moments), got {short_repr(permanent)}")
-    positions, moments = permanent
-    return positions, moments
+    return (np.zeros((0, 3)), np.zeros((0, 3))) if permanent is None else pair_of("permanent", permanent)
+
+
+def pair_of(name: str, value) -> tuple[Any, Any]:
+    """Return the two arrays of the argument ``permanent`` or ``curve_points``, or None twice for None."""
+    if value is None:
+        return None, None
+    if not isinstance(value, (tuple, list)) or len(value) != 2:
+        names = "positions, moments" if name == "permanent" else "fields, magnetizations"
+        raise InputError(f"{name}: must be ({names}), got {short_repr(value)}")
+    first, second = value
+    return first, second
+
+
+def _read_points(curve, points) -> tuple[MagnetizationCurve, dict[str, Any]]:
+    """Return the curve of the argument ``curve_points``, and its two arrays by name."""
+    if not isinstance(curve, str) or curve != "tanh":
+        raise InputError("curve_points: replace curve, give one or the other")
+    arrays: dict[str, Any] = dict(zip(POINT_ARRAYS, pair_of("curve_points", points), strict=True))
+    fields, magnetizations = (real_array(name, values) for name, values in arrays.items())
+    return MagnetizationCurve.from_mh(fields, magnetizations, name="curve_points"), arrays
 
 
 def _read_balls(context: CallContext, positions, radii, external_field, permanent) -> _Balls:
@@ -341,7 +365,9 @@ def _check_differentiable(settings: SolverSettings, arguments: dict) -> None:
         check_constant(arguments, f"the contact model {settings.contact_model!r} has none; use 'dipole'")
 
 
-def _read_result(context: CallContext, system: MomentSystem, balls: _Balls, arguments, initial) -> InductionResult:
+def _read_result(
+    context: CallContext, system: MomentSystem, balls: _Balls, arguments, initial, curve
+) -> InductionResult:
     """Return the result of a solve, checked to be finite, and warn if it did not converge."""
     dtype, n = context.dtype, balls.count
     saturations = system.material.saturation.numpy()[:n]
@@ -362,7 +388,7 @@ def _read_result(context: CallContext, system: MomentSystem, balls: _Balls, argu
         text = f"solve_induction: fields have an error of {field_error:.2g} > rtol {system.rtol:g}; use method direct"
         warn_caller(text, ConvergenceWarning)
     evaluations = int(system.evaluations.numpy().max(initial=0))
-    return InductionResult(m, h, error, evaluations, converged, field_error, system, context, arguments, balls)
+    return InductionResult(m, h, error, evaluations, converged, field_error, system, context, arguments, balls, curve)
 
 
 def _check_strength(dtype, strongest: float, saturation):

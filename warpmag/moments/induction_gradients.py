@@ -4,25 +4,34 @@ The balls are the first moments of a system, and the permanent dipoles follow (`
 """
 
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import warp as wp
 
+from warpmag.declarations.curve_gradients import point_gradients
 from warpmag.kernels.pairs.packing import launch_divide_by_volume, launch_volume_gradients
 from warpmag.moments.arrays import largest
 from warpmag.moments.system_gradients import SystemGradients
 from warpmag.moments.tape import Gradients
+
+POINT_ARRAYS: tuple[str, str] = "curve_points: fields", "curve_points: magnetizations"
+"""Names of the arrays of the argument ``curve_points``."""
 
 
 @dataclass(frozen=True)
 class BallGradients:
     """Gradients of one solve of ``count`` balls, at least one, by the arguments of :func:`warpmag.solve_induction`.
 
-    Permanent moments are named ``permanent: positions`` and ``permanent: moments``.
+    Permanent moments are named ``permanent: positions`` and ``permanent: moments``, points of a curve as in
+    ``POINT_ARRAYS``.
     """
 
     system: SystemGradients  # with the state loaded
     radii: wp.array  # of all moments [m], shape [n]
     count: int
+    curve: Any  # of the balls, a ``MagnetizationCurve`` where gradients by its points are needed
+    point_count: int  # points of the argument ``curve_points``, which may lack the curve's origin
 
     def of_solve(self, cotangents: list[wp.array], needed: set[str]) -> Gradients:
         """Return the gradients of a function of M and H from ∂L/∂M and ∂L/∂H, shape [count] each."""
@@ -41,7 +50,23 @@ class BallGradients:
                 saturation[: self.count],
                 susceptibility[: self.count],
             )
+        if needed & {*POINT_ARRAYS}:
+            gradients |= self._by_points(by_moments)
         return gradients
+
+    def _by_points(self, by_moments) -> Gradients:
+        """Return the gradients by the points of the measured curve; the curve is evaluated on the host."""
+        rho, h, radii = (
+            array[: self.count].numpy().astype(float)
+            for array in (self.system.moment_gradient(by_moments), self.system.h, self.radii)
+        )
+        strength = np.linalg.norm(h, axis=1)
+        along = np.divide(np.sum(h * rho, axis=1), strength, out=np.zeros_like(strength), where=strength > 0.0)
+        sums = point_gradients(self.curve, strength, 4.0 / 3.0 * np.pi * radii**3 * along)
+        return {
+            name: wp.array(values[-self.point_count :], dtype=wp.float64, device=self.radii.device)
+            for name, values in zip(POINT_ARRAYS, sums, strict=True)
+        }
 
     def of_wrench(self, cotangents: list[wp.array]) -> Gradients:
         """Return the gradients of a function of the balls' forces and torques from those by them, shape [count] each.

@@ -184,11 +184,15 @@ class SystemGradients:
         self.evaluate()
         self._tangent.iterate()
 
-    def parameters(self, by_moments) -> tuple[wp.array, wp.array]:
-        """Return the gradients by saturations and susceptibilities, shape [n] each, after :meth:`solve`."""
+    def moment_gradient(self, by_moments) -> wp.array:
+        """Return ρ, the total gradient by the inducible moments [1/(A·m²)], after :meth:`solve`, shape [n]."""
         rho = wp.clone(by_moments)
         launch_add_scaled(self.by_moments, rho)
-        return self._tangent.parameter_gradients(rho)
+        return rho
+
+    def parameters(self, by_moments) -> tuple[wp.array, wp.array]:
+        """Return the gradients by saturations and susceptibilities, shape [n] each, after :meth:`solve`."""
+        return self._tangent.parameter_gradients(self.moment_gradient(by_moments))
 
     def evaluations(self) -> np.ndarray:
         """Return the field evaluations of the last linear solve of each world, shape [worlds]. Waits for the device."""
