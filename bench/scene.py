@@ -64,7 +64,7 @@ def _balls_up(device, **parameters) -> Simulation:
 def _measured(simulation: Simulation, steps: int, device) -> tuple[dict, list[float]]:
     """Return the means of the next steps, the parts of a substep at their end, and the host's time of each step [s]."""
     before = copy.deepcopy(simulation.statistics)
-    seconds, host = _time_steps(simulation, steps, device)
+    seconds, host = time_steps(simulation, steps, device)
     after = simulation.statistics
     induction, force, rigid = after.milliseconds_since(before.steps)
     return {
@@ -80,7 +80,7 @@ def _measured(simulation: Simulation, steps: int, device) -> tuple[dict, list[fl
     }, host
 
 
-def _time_steps(simulation: Simulation, steps: int, device) -> tuple[float, list[float]]:
+def time_steps(simulation: Simulation, steps: int, device) -> tuple[float, list[float]]:
     """Return the mean time of a step, and the host's time of each step [s]."""
     host, began = [], time.perf_counter()
     for step in range(steps):
