@@ -9,6 +9,8 @@ from pathlib import Path
 
 import warp as wp
 
+from warpmag.kernels.shared.cores import cores
+
 _CLOCKS = {"NVIDIA H200": 1.98e9}  # clock of GPUs under load [Hz]
 _LANES = 128  # float32 operations that a multiprocessor of these GPUs starts per cycle
 
@@ -23,7 +25,7 @@ def describe(device) -> dict:
     return {
         "commit": _commit(),
         "device": device.name if device.is_cuda else "cpu",
-        "machine": f"{_processor()}, {os.cpu_count()} cores",
+        "machine": f"{_processor()}, {cores()} cores",
         "python": platform.python_version(),
         "warp": wp.__version__,
         "operations_per_second": device.sm_count * _LANES * _CLOCKS[device.name] if known else None,
