@@ -9,6 +9,7 @@ import magpylib
 import numpy as np
 import pytest
 
+import warpmag
 from bench import iron
 from bench.reference.iron_bodies import SETUPS, Body, Setup, load
 from bench.reference.oracle import MU0
@@ -75,6 +76,20 @@ def test_force_is_the_derivative_of_the_energy(plate, gap, device):
         expected = -(energies[1] - energies[0]) / (2.0 * step)
         assert abs(forces[1, axis] - expected) < 0.01 * np.linalg.norm(forces[1])
         np.testing.assert_allclose(forces.sum(axis=0), 0.0, atol=2e-6 * np.abs(forces).max())
+
+
+def test_reaction_on_an_only_magnet_is_that_on_one_among_others(device):
+    """An only magnet sums up the forces on the plate. With others its field is evaluated again, for its reaction."""
+    setup = with_magnet(TURNED, (0.0013, 0.0007), 3e-4)
+    weak = Body("cylinder", (0.003, 0.003), (0.0, 0.0, 0.3), 0.0, magnetization=(0.0, 0.0, 1.0))
+    wrenches = []
+    for bodies in (setup.bodies, (*setup.bodies, weak)):
+        model = iron.model_of(replace(setup, bodies=bodies), 0, device)
+        state = model.state()
+        warpmag.Magnetics(model).apply(state)
+        wrenches.append(state.body_f.numpy()[:2].reshape(4, 3))  # forces and torques of plate and magnet
+    for alone, among in zip(*wrenches, strict=True):  # up to rounding of sums of 1,000 terms in float32
+        np.testing.assert_allclose(alone, among, atol=5e-5 * np.linalg.norm(among))
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.0013, 0.0021])

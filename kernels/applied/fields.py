@@ -296,10 +296,23 @@ class AppliedForces(AppliedField):
         arrays, dtype, device = self.arrays, sources.dtype, self.device
         arrays.row = self._integers(rows, wp.vec4i)
         arrays.row_begin = self._integers(np.searchsorted(rows[:, 0], np.arange(len(world) + 1)))
+        arrays.only = self._integers(movable & self._acts_alone(world))
         arrays.partial = wp.zeros((len(rows), 6), dtype=dtype, device=device)
         self.wrenches = arrays.wrench = wp.zeros((len(movable), 7), dtype=dtype, device=device)
         world_has_several_solids = len(sources.solids) > len(np.unique(sources.solid_worlds))
         self._reacts, self._adds = len(rows) > 0, len(rows) > 0 or world_has_several_solids
+
+    def _acts_alone(self, world) -> np.ndarray:
+        """Return True for each source alone in its world, shape [sources], where fields are evaluated at all targets.
+
+        Moments of permanent bodies do not count as targets. ``world`` are the worlds of the sources, -1 for all.
+        """
+        missing = ~self.evaluated
+        for solid in self.sources.solids:
+            missing[solid.first : solid.first + solid.count] = False
+        alone = np.bincount(world[world >= 0], minlength=self.sources.world_count) + (world < 0).sum() == 1
+        alone[self._worlds[missing]] = False
+        return (world >= 0) & alone[world]
 
     def enable_rates(self, motion):
         """Evaluate the rates of change of fields from now on.
@@ -352,11 +365,12 @@ class AppliedForces(AppliedField):
         if self.arrays.effective is None or self.arrays.effective.ptr != effective.ptr:
             self.arrays.effective, self.arrays.balls.response = effective, response
             self._commands = {key: command for key, command in self._commands.items() if key[1] < ON_CELLS}
+        if self._moves or self._reacts:
+            self.run_passes(ON_CELLS, ON_CELLS, self.cell_count, _GROUP, _CELLS_PER_THREAD)
         if self._adds:
             self._add_up(REACT if self._reacts else ADD_UP)
         if not self._moves:
             return
-        self.run_passes(ON_CELLS, ON_CELLS, self.cell_count, _GROUP, _CELLS_PER_THREAD)
         inputs = [self.movable, self._source, effective, *self.along, self.wrenches]
         kernel = _force_kernel(self.sources.dtype)
         wp.launch(kernel, self.count, inputs=inputs, outputs=[forces, torques], device=self.device)

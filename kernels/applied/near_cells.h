@@ -312,31 +312,45 @@ CUDA_CALLABLE inline void add_cell_wrench(const Arrays& arrays, const Cell& cell
 }
 
 // Adds force and torque of near bodies on cell c. The torque m × H of its moment contains the averages already.
+// Writes those of a body that is the only source, for its reaction.
 template <class Arrays> CUDA_CALLABLE inline void act_on_cell(const Arrays& arrays, int c) {
     const Cell cell = cell_at(arrays, c);
-    if (!arrays.cells.near.data[c] || !arrays.cells.movable.data[cell.moment]) return;
+    const bool movable = arrays.cells.movable.data[cell.moment];
+    const bool only = arrays.only.data[arrays.coils.kind.shape[0] + cell.first];
+    if (!arrays.cells.near.data[c] || !(movable || only)) return;
     const size_t pitch = arrays.effective.strides[0] / sizeof(Real);
     const Real3 m = effective_at(arrays.effective.data, pitch, cell.moment);
     const Real3 change = real3((const Real*)arrays.cells.change.data + 3 * (size_t)c);
     Real3 force = {0, 0, 0}, torque = cross(change, m);
     for (int b = cell.first; b < cell.last; ++b) add_cell_wrench(arrays, cell, c, body_at(arrays, b), force, torque);
     if (share() != 0) return;
+    if (only) {
+        Real* const wrench = arrays.cells.wrench.data + 6 * (size_t)c;
+        for (int k = 0; k < 6; ++k) wrench[k] = 0;
+        add_force_torque(wrench, force, torque, 1);
+    }
+    if (!movable) return;
     add_real3(arrays.cells.forces, cell.moment, MU0 * force);
     add_real3(arrays.cells.torques, cell.moment, MU0 * torque);
 }
 
-// Force/μ0 on cells ``first`` to ``last`` − 1 by a body, and their torque/μ0 about its reference point.
+// Force/μ0 on cells ``first`` to ``last`` − 1 by a body, and their torque/μ0 about its reference point. If the body is
+// the only source, :func:`act_on_cell` has written them.
 template <class Arrays>
-CUDA_CALLABLE inline void wrench_on_cells(const Arrays& arrays, const PermanentBody& body, int first, int last,
-                                          Real3& force, Real3& torque) {
+CUDA_CALLABLE inline void wrench_on_cells(const Arrays& arrays, const PermanentBody& body, bool only, int first,
+                                          int last, Real3& force, Real3& torque) {
     const Real3 center = reference_point(arrays, body);
     for (int c = first; c < last; ++c) {
         if (!arrays.cells.near.data[c]) continue;
-        const Cell cell = cell_at(arrays, c);
         Real3 f = {0, 0, 0}, t = f;
-        add_cell_wrench(arrays, cell, c, body, f, t);
+        if (only) {
+            const Real* const wrench = arrays.cells.wrench.data + 6 * (size_t)c;
+            f = real3(wrench), t = real3(wrench + 3);
+        } else {
+            add_cell_wrench(arrays, cell_at(arrays, c), c, body, f, t);
+        }
         force += f;
-        torque += t + cross(cell.center - center, f);
+        torque += t + cross(packed_real3(arrays, 0, arrays.cells.cell.data[c][0]) - center, f);
     }
 }
 }

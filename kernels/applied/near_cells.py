@@ -61,6 +61,9 @@ def cell_arrays_type(dtype):
         # Data out:
         change: wp.array[vec3]  # change of the field that exerts torques by the averages [A/m], shape [cells]
         steepness: wp.array[vec3]  # half the field's difference between a cell's halves, along the grid [A/m], [cells]
+        wrench: wp.array2d[
+            dtype
+        ]  # force/μ0 and torque/μ0 of a source that is the only one [A²], [A² m], shape [cells, 6]
         near: wp.array[int]  # how near a body is that acts on a cell: 0, 1 for differences, NEAR, shape [cells]
         potential: wp.array[dtype]  # potential of these bodies at the points, faded [A], shape [cells, 6 FACE_POINTS]
 
@@ -143,6 +146,7 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solid_rang
     arrays.grid, arrays.rotation, arrays.point = put(grids, dtype), rotations, put(unit_points().ravel(), dtype)
     arrays.response = put(np.concatenate([body.response.ravel() for body in shapes]), dtype)
     arrays.movable = put(movable)
+    arrays.wrench = wp.empty((len(row), 6), dtype=dtype, device=device)
     arrays.near = wp.zeros(len(row), dtype=wp.int32, device=device)
     arrays.change, arrays.steepness = (
         wp.zeros(len(row), dtype=wp.types.vector(3, dtype), device=device) for _ in range(2)

@@ -120,6 +120,13 @@ template <bool POINTS, class Arrays> CUDA_CALLABLE inline void field_at_targets(
     if constexpr (RATES) put_vectors((Real*)arrays.targets.rate.data + column, lane_count, rate);
 }
 
+// Field that acts on targets, as last evaluated: that of a source that is the only one.
+template <class Arrays> CUDA_CALLABLE inline TargetField acting_field(const Arrays& arrays, int i, int lane_count) {
+    auto at = [&](const auto& array) { return vectors((const Real*)array.data + 3 * (size_t)i, lane_count); };
+    return {at(arrays.targets.acting) - at(arrays.targets.base), at(arrays.targets.along_x), at(arrays.targets.along_y),
+            at(arrays.targets.along_z)};
+}
+
 // Wrench of source s on the targets of a row. The reaction on the source is the opposite.
 template <class Arrays>
 CUDA_CALLABLE inline Wrench wrench_on_targets(const Arrays& arrays, int s, const PermanentBody& body, int first,
@@ -130,21 +137,21 @@ CUDA_CALLABLE inline Wrench wrench_on_targets(const Arrays& arrays, int s, const
         solid ? reference_point(arrays, body) : real3((const Real*)arrays.coils.frame.data + 7 * (size_t)s);
     const size_t pitch = arrays.effective.strides[0] / sizeof(Real);
     // a row of few targets: the threads share the moments and faces of the body in place of the targets
-    const bool shares_body = solid && last - first < SHARES;
+    const bool only = arrays.only.data[s], shares_body = solid && !only && last - first < SHARES;
     const int begin = shares_body ? share() : 0, step = shares_body ? SHARES : 1;
     for (int i = first + WIDTH * (share() - begin); i < last; i += WIDTH * SHARES / step) {
         const Targets at = targets_at(arrays, i, last - i);
         const Real* const m = arrays.effective.data + i;
         Mask mask = first_lanes(last - i);
-        TargetField field = zero_target_field();
+        TargetField field = only ? acting_field(arrays, i, last - i) : zero_target_field();
         if constexpr (SOLIDS)
-            if (solid) {
+            if (solid && !only) {
                 mask &= within_reach<Arrays>(body, at) & (at.label != body.label);
                 if (!any(mask)) continue;
                 field = target_field(field_correction(arrays, body, at.x, at.radius, mask, begin, step));
             }
         if constexpr (COILS)
-            if (!solid) add_coil_fields(arrays, &s, 0, 1, 1, at, last - i, field);
+            if (!solid && !only) add_coil_fields(arrays, &s, 0, 1, 1, at, last - i, field);
         add_wrench(wrench, mask, field, {numbers(m), numbers(m + pitch), numbers(m + 2 * pitch)}, at.x, center);
     }
     return wrench;
@@ -160,7 +167,7 @@ template <class Arrays> CUDA_CALLABLE inline void react(const Arrays& arrays, in
         const Wrench wrench = wrench_on_targets(arrays, s, body, range[1], range[2]);
         force = total_of(wrench.force), torque = total_of(wrench.torque);
     } else if (CELLS && range[3] == OF_CELLS) {
-        if constexpr (CELLS) wrench_on_cells(arrays, body, range[1], range[2], force, torque);
+        if constexpr (CELLS) wrench_on_cells(arrays, body, arrays.only.data[s], range[1], range[2], force, torque);
     } else if constexpr (BALLS) {
         const Real3 center =
             s < coils ? real3((const Real*)arrays.coils.frame.data + 7 * (size_t)s) : reference_point(arrays, body);

@@ -161,6 +161,7 @@ def source_arrays_type(dtype):
         # Reactions on sources:
         row: wp.array[wp.vec4i]  # source, range of targets, balls or cells, which of these (``fields``)
         row_begin: wp.array[int]  # first row of each source
+        only: wp.array[int]  # 1 for a source with a reaction whose field is all that acts on targets of its world
         partial: wp.array2d[dtype]  # force and torque of each row, shape [rows, 6]
         wrench: wp.array2d[dtype]  # force, torque and half the energy of each source, shape [sources, 7]
 
