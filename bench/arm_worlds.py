@@ -24,6 +24,8 @@ DISC = {"radius": 0.01, "half_height": 0.0025}  # N42 magnet [m]
 PLATE = {"hx": 0.03, "hy": 0.03, "hz": 0.0015}  # [m]
 BALL, RING = 0.005, 0.02  # radius of a ball, and of the circle of all four [m]
 TOPS = {"plate": 2.0 * PLATE["hz"], "balls": 2.0 * BALL}  # heights above the ground [m]
+CASES = ("plate", "dipole"), ("balls", "dipole"), ("balls", "multipole")
+"""Objects under the magnet, and contact models."""
 GAPS = (0.1, 0.06, 0.04, 0.03, 0.02, 0.01, 0.005, 0.002, 0.0005, 0.0)  # between magnet and object [m]
 SPACINGS = (0.012, 0.006, 0.0, 0.002)  # of the plate's moments [m]; 0 is automatic
 SPACING_GAPS = (0.1, 0.02, 0.002)
@@ -76,7 +78,16 @@ def add_object(builder: newton.ModelBuilder, name: str, spacing: float) -> list[
 class ArmWorlds:
     """Worlds of the arm with its magnets and MuJoCo."""
 
-    def __init__(self, name: str, worlds: int, device, *, spacing: float = 0.0, solver: bool = True):
+    def __init__(
+        self,
+        name: str,
+        worlds: int,
+        device,
+        *,
+        spacing: float = 0.0,
+        contact_model: str = "dipole",
+        solver: bool = True,
+    ):
         """Build the worlds. Without ``solver``, and in several worlds on a CPU, there is no MuJoCo."""
         world = newton.ModelBuilder()
         newton.solvers.SolverMuJoCo.register_custom_attributes(world)
@@ -90,7 +101,7 @@ class ArmWorlds:
         builder.add_ground_plane(cfg=newton.ModelBuilder.ShapeConfig(**HARD))
         self.model = builder.finalize(device=self.device)
         began = time.perf_counter()
-        self.magnetics = warpmag.Magnetics(self.model)
+        self.magnetics = warpmag.Magnetics(self.model, contact_model=contact_model)
         wp.synchronize_device(self.device)
         self.build_seconds = time.perf_counter() - began
         self.solver = None
@@ -151,14 +162,15 @@ def forces_at(name: str, gaps, device, spacing: float) -> np.ndarray:
 
 
 def run_gaps(worlds: int, device, refined: dict) -> Iterator[dict]:
-    """Yield times and forces at each gap, of balls and of the plate; ``refined`` has the spacings of the reference."""
-    for name in TOPS:
-        exact = forces_at(name, GAPS, device, refined[name])
-        arm = ArmWorlds(name, worlds, device)
+    """Yield times and forces at each gap in each case; ``refined`` has the spacings of the reference."""
+    exact_forces = {name: forces_at(name, GAPS, device, refined[name]) for name in TOPS}
+    for name, contact_model in CASES:
+        exact, arm = exact_forces[name], ArmWorlds(name, worlds, device, contact_model=contact_model)
         for gap, reference in zip(GAPS, exact, strict=True):
             arm.place(gap)
             force = float(arm.forces()[-1])
-            line = {"part": "gaps", "object": name, "gap": gap, "worlds": worlds, "build_seconds": arm.build_seconds}
+            line = {"part": "gaps", "object": name, "contact_model": contact_model, "gap": gap, "worlds": worlds}
+            line["build_seconds"] = arm.build_seconds
             yield line | arm.times() | {"force": force, "error": abs(force - reference) / abs(reference)}
 
 
@@ -256,14 +268,15 @@ def draw(lines: list[dict], path: Path) -> None:
 
     figure, (cost, error, both) = plt.subplots(1, 3, figsize=(12.6, 4.2), layout="constrained")
     of_part = {part: [line for line in lines if line["part"] == part] for part in PARTS}
-    for name in TOPS:
-        points = [line for line in of_part["gaps"] if line["object"] == name and line["gap"] > 0.0]
-        gaps = [1e3 * line["gap"] for line in points]
-        (curve,) = cost.plot(gaps, [line["magnetics_ms"] for line in points], marker=".", label=f"magnets, {name}")
+    for case in CASES:
+        points = [line for line in of_part["gaps"] if (line["object"], line["contact_model"]) == case and line["gap"]]
+        gaps, label = [1e3 * line["gap"] for line in points], ", ".join(case)
+        (curve,) = cost.plot(gaps, [line["magnetics_ms"] for line in points], marker=".", label=label)
         style = {"color": curve.get_color(), "marker": "."}
-        label = f"MuJoCo, {name}"
-        cost.plot(gaps, [line.get("mujoco_ms") for line in points], linestyle="--", label=label, **style)
-        error.plot(gaps, [100.0 * line["error"] for line in points], label=name, **style)
+        if case[1] == "dipole":
+            times = [line.get("mujoco_ms") for line in points]
+            cost.plot(gaps, times, linestyle="--", label=f"MuJoCo with {case[0]}", **style)
+        error.plot(gaps, [100.0 * line["error"] for line in points], label=label, **style)
     for gap in SPACING_GAPS:
         points = [line for line in of_part["spacings"] if line["gap"] == gap]
         times = [1e3 * line["magnetics_ms"] / line["worlds"] for line in points]
