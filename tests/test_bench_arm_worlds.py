@@ -17,9 +17,8 @@ def test_all_parts(tmp_path, device, monkeypatch, capsys):
     arm_worlds.main([*options, "-o", str(tmp_path / "lines")])
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     gaps, spacings, phases = ([line for line in lines if line["part"] == part] for part in arm_worlds.PARTS)
-    assert [(line["object"], line["gap"]) for line in gaps] == [
-        (o, g) for o in ("plate", "balls") for g in (0.1, 0.002)
-    ]
+    expected = [(*case, gap) for case in arm_worlds.CASES for gap in (0.1, 0.002)]
+    assert [(line["object"], line["contact_model"], line["gap"]) for line in gaps] == expected
     for line in gaps:
         assert line["magnetics_ms"] > 0.0
         assert line["mujoco_ms"] > 0.0
