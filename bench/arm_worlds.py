@@ -284,13 +284,15 @@ def draw(lines: list[dict], path: Path) -> None:
         for x, line in zip(times, points, strict=True):
             both.annotate(f"{line['cells']}", (x, 100.0 * line["error"]), fontsize="x-small")
     worlds = of_part["gaps"][0]["worlds"] if of_part["gaps"] else 0
-    cost.set(ylabel=f"time of a step of {worlds:,} worlds [ms]", yscale="log")
-    error.set(ylabel="error of the force [%]", yscale="log")
-    both.set(xscale="log", yscale="log", xlabel="magnetic step of a world [µs]", ylabel="error of the force [%]")
+    cost.set(ylabel=f"time of a step of {worlds:,} world{'s' * (worlds > 1)} [ms]", xlabel="gap [mm]")
+    error.set(ylabel="error of the force [%]", xlabel="gap [mm]")
+    both.set(xlabel="magnetic step of a world [µs]", ylabel="error of the force [%]")
     both.set_title("plate, numbers of cells", fontsize="small")
-    for axis in (cost, error):
-        axis.set(xscale="log", xlabel="gap [mm]")
     for axis in (cost, error, both):
+        axis.set(xscale="log", yscale="log")
+        for numbers in (axis.xaxis, axis.yaxis):  # at 1, 2 and 5 of each decade
+            numbers.set_major_formatter("{x:g}")
+            numbers.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "25" else "")
         axis.grid(True, alpha=0.3)
         if axis.get_legend_handles_labels()[0]:
             axis.legend(fontsize="x-small")
