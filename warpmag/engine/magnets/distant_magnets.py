@@ -188,10 +188,11 @@ class DistantMagnets:
         wp.capture_if(choice.any_few_begin, partial(few.start_cold, choice.few_begin))
         wp.capture_if(choice.any_few, few.solve)
         self._launches.finish_few()
-        wp.capture_if(choice.any_many_begin, partial(self._many.system.start_cold, choice.many_begin))
         wp.capture_if(choice.any_many, partial(self._solve_many, values))
 
     def _solve_many(self, values: ModelValues) -> None:
+        choice = self._choice
+        wp.capture_if(choice.any_many_begin, partial(self._many.system.start_cold, choice.many_begin))
         self._many.gather(self._poses, values)
         if self._resting is not None:  # a single world rests as a whole
             self._resting.leave_out()
