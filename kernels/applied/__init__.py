@@ -20,6 +20,7 @@ none of these kernels is launched.
 | solids | tables of permanent bodies and of the polyhedra that bound them |
 | near_cells | cells near permanent bodies: averages of the field, charges on their faces |
 | coil_gradients | gradients of functions of what coils and maps do |
+| solid_gradients | gradients of functions of what permanent bodies do near other magnets |
 | expansion | points and tables for the expansion of a field about a ball |
 | `passes.h` | passes over targets and sources |
 | `target_field.h` | field and gradient at a vector of targets, and the force on moments there |

@@ -49,6 +49,11 @@ class SolidMagnet:
     response: float = 0.0  # k = 3χ/(3 + χ) if it responds to fields, else 0
     far_reach: float = 0.0  # distance from which on its moments in the system act alone [m], at least ``reach``
 
+    @property
+    def has_few_moments(self) -> bool:
+        """True if the system has fewer moments than ``moments``."""
+        return self.count < len(self.moments.volumes)
+
     def size(self) -> list[float]:
         """Return the body's row of ``size``."""
         reaches = self.reach, max(self.reach, self.far_reach)

@@ -108,6 +108,18 @@ def add_rotation_gradients(bodies, body_q, rotations, by_rotations) -> None:
     _differentiate(_multiply_rotations, len(bodies), [bodies, body_q, rotations, by_rotations], body_q.device)
 
 
+@wp.kernel(module="unique", enable_backward=False)
+def _copy_rotations(frames_in: wp.array[wp.transform], rotations_out: wp.array[wp.quat]):
+    rotations_out[wp.tid()] = wp.transform_get_rotation(frames_in[wp.tid()])
+
+
+def rotations_of(frames: wp.array) -> wp.array:
+    """Return the rotations of transforms, quaternions, shape [k]."""
+    rotations = wp.empty(len(frames), dtype=wp.quat, device=frames.device)
+    wp.launch(_copy_rotations, len(frames), inputs=[frames], outputs=[rotations], device=frames.device)
+    return rotations
+
+
 def _differentiate(kernel, count: int, inputs, device) -> None:
     """Add to the gradients of inputs those of the sum of a kernel's ``count`` products."""
     products = wp.zeros(count, dtype=float, device=device, requires_grad=True)

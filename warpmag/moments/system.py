@@ -316,7 +316,7 @@ class MomentSystem:
     def gradients(self) -> SystemGradients:
         """Gradients of solves and forces. Their buffers are allocated at the first access."""
         arrays = self._packed, self._induction, self.material, self.worlds, self.world_ranges
-        return SystemGradients(*arrays, self.rtol, self.fmm_rtol, self.sources, self._couplings)
+        return SystemGradients(*arrays, self.rtol, self.fmm_rtol, self.source_interaction, self._couplings)
 
     def start_cold(self, chosen: wp.array | None = None):
         """Start the next solve as the first one, from zero magnetization, in chosen worlds.

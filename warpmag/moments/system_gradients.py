@@ -29,7 +29,8 @@ import warp as wp
 
 from warpmag.errors import ConvergenceWarning, InputError, warn_caller
 from warpmag.kernels.applied.coil_gradients import CoilGradients
-from warpmag.kernels.applied.sources import FieldSources
+from warpmag.kernels.applied.fields import AppliedForces
+from warpmag.kernels.applied.solid_gradients import SolidGradients
 from warpmag.kernels.induction.cell_turns import CellTurns
 from warpmag.kernels.induction.tangent import Tangent
 from warpmag.kernels.material.curves import CurveParameters
@@ -58,13 +59,15 @@ class SystemGradients:
         ranges: (First moment, first permanent moment, end) of each world.
         rtol: Relative error of the solves, and of the linear solve.
         fmm_rtol: Relative error of fields by the fast multipole method; None means sums over all pairs.
-        sources: Coils and field maps; None without them.
+        interaction: Fields and forces of coils, field maps and permanent bodies; None without them.
         couplings: First moment and coupling of each body of cells, of which a world has one at most.
 
     Attributes:
         cells: Gradients by rotations of bodies of cells; None without them. The caller writes their state after
             :meth:`load`.
         coils: Gradients by coils and field maps; None without them. The caller writes their state after :meth:`load`.
+        solids: Gradients by permanent bodies with closed forms; None without them. The caller writes their ``frames``
+            after :meth:`load`.
         positions: State: positions [m], shape [n].
         moments: State: moments [A·m²], shape [n].
         h: State: field [A/m] in which M = f(H), shape [n].
@@ -84,7 +87,7 @@ class SystemGradients:
         ranges,
         rtol: float,
         fmm_rtol: float | None,
-        sources: FieldSources | None = None,
+        interaction: AppliedForces | None = None,
         couplings=(),
     ):
         """Allocate the buffers."""
@@ -111,7 +114,11 @@ class SystemGradients:
             self.fields = PairGradients(self._moments, ends, cotangents=self._acting.moments)
         else:
             self.fields = _EvaluatedGradients(self._moments, self._acting, self._fast or (None, None), ranges)
-        self.coils = CoilGradients(sources, self._bodies, worlds) if sources and sources.applied else None
+        self.coils = self.solids = None
+        if interaction is not None and interaction.sources.applied:
+            self.coils = CoilGradients(interaction.sources, self._bodies, worlds)
+        if interaction is not None and interaction.sources.solids:
+            self.solids = SolidGradients(interaction, worlds, packed.labels)
         self.by_field = self._tangent.eta
         self.by_positions, self.by_moments = self.fields.by_positions, self.fields.by_moments
 
@@ -133,6 +140,8 @@ class SystemGradients:
         self._tangent.linearize(self.h)
         if self.coils is not None:
             self.coils.by_sources.zero_()
+        if self.solids is not None:
+            self.solids.load(self.positions, self.moments)
 
     def evaluate(self) -> None:
         """Launch one field evaluation of the linear solve."""
@@ -149,6 +158,8 @@ class SystemGradients:
         sums.launch(force_cotangents, torque_cotangents)
         if self.coils is not None:
             self.coils.launch_wrench(force_cotangents, torque_cotangents, sums.by_positions, sums.by_moments)
+        if self.solids is not None:
+            self.solids.launch_wrench(force_cotangents, torque_cotangents, sums.by_positions, sums.by_moments)
         return sums
 
     def solve(self, by_moments, by_field=None, *, warm: bool = False) -> None:
@@ -178,6 +189,8 @@ class SystemGradients:
             self.cells.turn(self.moments, self.by_field, self.by_moments)
         if self.coils is not None:
             self.coils.launch_field(self.by_field, self.by_positions, self.by_moments)
+        if self.solids is not None:
+            self.solids.launch_field(self.by_field, self.by_positions)
 
     def _iterate(self):
         """Launch an iteration of the linear solve."""

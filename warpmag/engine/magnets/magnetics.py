@@ -141,7 +141,7 @@ class Magnetics:
         self._permanent_shapes = PermanentShapes(model, self.magnets)
         newton_worlds = np.maximum(self._worlds, 0)[self.system.worlds]
         self._newton_world = wp.array(newton_worlds, dtype=wp.int32, device=model.device)
-        self._gradients = ForceGradients(self.system, placed.table, self._sources, model, placed.coupled_bodies)
+        self._gradients = ForceGradients(placed, self._sources, model)
         self._start = WorldStart(model, self._worlds, self.system)
         set_conductivities(model, self.magnets, self.system, float(dt))
         if imported is not None:

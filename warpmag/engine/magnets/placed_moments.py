@@ -29,6 +29,7 @@ class PlacedMoments:
         volumes: Volume of each moment [m³], shape [n].
         recoiling: Moments with recoil permeability, on the device.
         coupled_bodies: Body of each magnet of cells, in the order of ``system.rotations``, on the device.
+        solid_bodies: Body of each permanent part with a closed form, in the order of ``system.sources.solid_frames``.
     """
 
     def __init__(self, model: newton.Model, magnets: list[BodyMagnet], settings, **options):
@@ -64,7 +65,7 @@ class PlacedMoments:
         moments.runs = put(np.stack([start[:-1], start[1:]], axis=1)[order], wp.vec2i)
         moments.resting = self.system.resting
 
-        self.coupled_bodies, self._solid_bodies = put(coupled_bodies, wp.int32), put(solid_bodies, wp.int32)
+        self.coupled_bodies, self.solid_bodies = put(coupled_bodies, wp.int32), put(solid_bodies, wp.int32)
         susceptibility = np.repeat([material.recoil_permeability - 1.0 for material in materials], counts)
         recoiling = np.flatnonzero(np.repeat([material.recoils for material in materials], counts))
         self.recoiling, self._bias_factors = put(recoiling, wp.int32), put(1.0 / susceptibility[recoiling], float)
@@ -82,8 +83,8 @@ class PlacedMoments:
         system = self.system
         if system.rotations is not None:
             gather_rotations(body_q, self.coupled_bodies, system.rotations)
-        if len(self._solid_bodies):
-            gather_frames(body_q, self._solid_bodies, system.sources.solid_frames)
+        if len(self.solid_bodies):
+            gather_frames(body_q, self.solid_bodies, system.sources.solid_frames)
 
     def add_wrenches(self, model: newton.Model, state: newton.State) -> None:
         """Add the forces that the system computed to ``state.body_f``, but not in worlds where it rests."""

@@ -1,21 +1,25 @@
 """Gradients of the forces on bodies by poses, coils, magnetizations and the external field, recorded on Warp's tape."""
 
+import numpy as np
 import warp as wp
 
 from warpmag.declarations.attributes import NAMESPACE
+from warpmag.engine.magnets.placed_moments import PlacedMoments
 from warpmag.engine.magnets.sources import ModelSources
 from warpmag.errors import InputError
-from warpmag.kernels.rigid.bodies import BodyMoments
 from warpmag.kernels.rigid.pose_gradients import (
     add_coil_gradients,
     add_pose_gradients,
     add_rotation_gradients,
+    rotations_of,
     spread_cotangents,
     spread_to_coils,
 )
 from warpmag.kernels.shared.axpy import launch_add_scaled
 from warpmag.moments.system import MomentSystem
 from warpmag.moments.tape import differentiable, paused_tape
+
+_MAGNETIZATION = "model.warpmag.magnetization"
 
 
 def _check_gradients(name: str, system: MomentSystem, sources: ModelSources) -> None:
@@ -26,7 +30,7 @@ def _check_gradients(name: str, system: MomentSystem, sources: ModelSources) -> 
         f"the dynamics {settings.dynamics!r}": settings.dynamics != "theta",
         f"the contact model {settings.contact_model!r}": settings.contact_model != "dipole",
         "the force between bodies of cells": system.crowded is not None,
-        "the near field of a permanent body": system.source_interaction is not None and _closed_forms_act(system),
+        "the near field of a permanent body at cells of iron": _closed_forms_act_on_cells(system),
         "a coil with a resistance, whose current follows from voltages,": sources.circuits is not None,
         "recoil permeability": system.bias is not None,
         "eddy currents": system.eddy is not None,
@@ -36,30 +40,29 @@ def _check_gradients(name: str, system: MomentSystem, sources: ModelSources) -> 
             raise InputError(f"{name}: requires a gradient, but {reason} has none")
 
 
-def _closed_forms_act(system: MomentSystem) -> bool:
-    """Return False if no permanent body with a closed form is near any other magnet. Waits for the device.
+def _closed_forms_act_on_cells(system: MomentSystem) -> bool:
+    """Return False if no permanent body with a closed form is near cells of iron. Waits for the device.
 
-    Then the pairs of moments are the whole force. With coils, or in a captured graph, nobody can tell.
+    With coils, or in a captured graph, nobody can tell.
     """
     interaction, sources = system.source_interaction, system.sources
-    if not sources.solids:
+    if interaction is None or not interaction.cell_count:
         return False
     if sources.applied or system.device.is_capturing:
         return True
-    corrected = (interaction.field.numpy() != system.external_field.numpy())[interaction.evaluated]
-    return bool(corrected.any() or interaction.wrenches.numpy().any())
+    cells = interaction.arrays.cells.cell.numpy()[:, 0]
+    return bool((interaction.field.numpy() != system.external_field.numpy())[cells].any())
 
 
 class ForceGradients:
     """Gradients of the forces that :meth:`Magnetics.apply` adds to ``state.body_f``."""
 
-    def __init__(self, system: MomentSystem, magnets: BodyMoments, sources: ModelSources, model, coupled):
-        """Prepare the gradients of a system with the moments ``magnets`` and the coils ``sources`` of a model.
-
-        ``coupled`` are the bodies of cells, in the order of ``system.rotations``.
-        """
-        self._system, self._magnets, self._sources, self._model = system, magnets, sources, model
-        self._coupled = coupled
+    def __init__(self, placed: PlacedMoments, sources: ModelSources, model):
+        """Prepare the gradients of the moments ``placed`` and the coils ``sources`` of a model."""
+        self._system, self._magnets, self._sources, self._model = placed.system, placed.table, sources, model
+        self._placed = placed
+        iron = [magnet.body for magnet in placed.magnets if magnet.magnet.kind == "inducible" and magnet.body >= 0]
+        self._shares_body = bool(np.isin(iron, placed.solid_bodies.numpy()).any())
 
     def arguments(self, state) -> dict[str, wp.array]:
         """Return the arrays that require a gradient, by name."""
@@ -68,7 +71,7 @@ class ForceGradients:
             {
                 "state.body_q": state.body_q,
                 "model.shape_transform": self._model.shape_transform,
-                "model.warpmag.magnetization": attributes.magnetization,
+                _MAGNETIZATION: attributes.magnetization,
                 "model.warpmag.strength": attributes.strength,
                 "external_field": self._system.external_field,
             }
@@ -79,7 +82,15 @@ class ForceGradients:
         required = self.arguments(state)
         if not required:
             return
-        _check_gradients(next(iter(required)), self._system, self._sources)
+        name = next(iter(required))
+        _check_gradients(name, self._system, self._sources)
+        if self._shares_body:
+            raise InputError(f"{name}: requires a gradient, but a permanent box or cylinder with iron on it has none")
+        solids = () if self._system.sources is None else self._system.sources.solids
+        if _MAGNETIZATION in required and any(solid.has_few_moments for solid in solids):
+            raise InputError(
+                f"{_MAGNETIZATION}: requires a gradient, but the model does not, call finalize(requires_grad=True)"
+            )
         state.body_f.requires_grad = True
         solved = _SolvedMoments(self._system)  # the next call overwrites the system's arrays
 
@@ -103,10 +114,15 @@ class ForceGradients:
         gradients.check()
         launch_add_scaled(sums.by_positions, gradients.by_positions)
         launch_add_scaled(sums.by_moments, gradients.by_moments)
+        solids = gradients.solids
+        if solids is not None:
+            if getattr(model, NAMESPACE).magnetization.requires_grad:
+                solids.launch_magnetizations(gradients.by_moments)
+            add_rotation_gradients(self._placed.solid_bodies, body_q, rotations_of(solids.frames), solids.by_rotations)
         add_pose_gradients(self._magnets, model, body_q, gradients.by_positions, gradients.by_moments, arms)
         cells = gradients.cells
         if cells is not None:
-            add_rotation_gradients(self._coupled, body_q, cells.rotations, cells.by_rotations)
+            add_rotation_gradients(self._placed.coupled_bodies, body_q, cells.rotations, cells.by_rotations)
         if coils is not None:
             add_coil_gradients(self._sources.on_device, model, body_q, coils.frames, coils.by_sources)
         by_external_field = self._system.external_field.grad
@@ -125,6 +141,7 @@ class _SolvedMoments:
         self._external_field = wp.clone(system.external_field, requires_grad=False)
         coils = system.sources
         self._coils = None if coils is None else (wp.clone(coils.frames), wp.clone(coils.strengths))
+        self._solids = None if coils is None else wp.clone(coils.solid_frames)
         self._rotations = None if system.rotations is None else wp.clone(system.rotations)
 
     def load(self) -> None:
@@ -136,3 +153,5 @@ class _SolvedMoments:
         if self._coils is not None and gradients.coils is not None:
             wp.copy(gradients.coils.frames, self._coils[0])
             wp.copy(gradients.coils.strengths, self._coils[1])
+        if self._solids is not None and gradients.solids is not None:
+            wp.copy(gradients.solids.frames, self._solids)
