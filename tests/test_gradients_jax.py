@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 import warp as wp
+from wrong_calls import WRONG
 
 jax = pytest.importorskip("jax", reason="JAX is not installed")
 
@@ -93,16 +94,6 @@ def test_what_has_no_gradient_raises(place):
         jax.block_until_ready(jax.grad(lambda radius: warpmag.jax.h_field(x, m, radii=radius, device=place).sum())(0.1))
     with pytest.raises(warpmag.InputError, match="positions: must be float32 or float64"):
         warpmag.jax.h_field(x.astype(jnp.float16), m)
-
-
-WRONG = {
-    "shape": (lambda h_field, x, m: h_field(x, m[:, :2]), r"moments: shape must be \[3, 3\], got \[3, 2\]"),
-    "none": (lambda h_field, x, m: h_field(x, None), "moments: must be real numbers, got None"),
-    "text": (lambda h_field, x, m: h_field(x, m, radii="1"), "radii: must be real numbers, got '1'"),
-    "places": (lambda h_field, x, m: h_field(x, m, x[0]), r"targets: shape must be \[n, 3\], got \[3\]"),
-    "owner": (lambda h_field, x, m: h_field(x, m, target_radii=0.1), "target_radii: only with targets"),
-    "complex": (lambda h_field, x, m: h_field(x, 1j * m), "moments: must be real numbers, got .*complex128"),
-}
 
 
 @pytest.mark.parametrize("case", WRONG)

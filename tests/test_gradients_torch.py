@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+from wrong_calls import WRONG
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed")
 
@@ -100,16 +101,6 @@ def test_what_has_no_gradient_raises(device):
         warpmag.torch.h_field(x, m, radii=radii)
     with pytest.raises(warpmag.InputError, match="positions: must be a tensor"):
         warpmag.torch.h_field(x.detach().half(), m)
-
-
-WRONG = {
-    "shape": (lambda h_field, x, m: h_field(x, m[:, :2]), r"moments: shape must be \[3, 3\], got \[3, 2\]"),
-    "none": (lambda h_field, x, m: h_field(x, None), "moments: must be real numbers, got None"),
-    "text": (lambda h_field, x, m: h_field(x, m, radii="1"), "radii: must be real numbers, got '1'"),
-    "places": (lambda h_field, x, m: h_field(x, m, x[0]), r"targets: shape must be \[n, 3\], got \[3\]"),
-    "owner": (lambda h_field, x, m: h_field(x, m, target_radii=0.1), "target_radii: only with targets"),
-    "complex": (lambda h_field, x, m: h_field(x, 1j * m), "moments: must be real numbers, got .*complex128"),
-}
 
 
 @pytest.mark.parametrize("case", WRONG)

@@ -85,6 +85,17 @@ def add_pose_gradients(magnets: BodyMoments, model, body_q, by_positions, by_mom
     _differentiate(_multiply_poses, len(by_positions), inputs, body_q.device)
 
 
+@wp.func
+def _rotation_product(outer: wp.transform, inner: wp.transform, rotation: wp.quat, gradient: wp.vec3):
+    """Sum of w_k·e_k over the axes e_k of the frame ``outer inner``, which has the ``rotation``."""
+    product = float(0.0)
+    for k in range(3):
+        unit = wp.vec3(float(k == 0), float(k == 1), float(k == 2))
+        axis = wp.transform_vector(outer, wp.transform_vector(inner, unit))
+        product = product + 0.5 * wp.dot(axis, wp.cross(gradient, wp.quat_rotate(rotation, unit)))
+    return product
+
+
 @wp.kernel(module="unique", enable_backward=True)
 def _multiply_rotations(
     bodies: wp.array[wp.int32],
@@ -96,10 +107,7 @@ def _multiply_rotations(
     k = wp.tid()
     product = float(0.0)
     if bodies[k] >= 0:
-        for c in range(3):
-            unit = wp.vec3(float(c == 0), float(c == 1), float(c == 2))
-            axis = wp.transform_vector(body_q[bodies[k]], unit)
-            product = product + 0.5 * wp.dot(axis, wp.cross(by_rotations[k], wp.quat_rotate(rotations[k], unit)))
+        product = _rotation_product(body_q[bodies[k]], wp.transform_identity(), rotations[k], by_rotations[k])
     products_out[k] = product
 
 
@@ -185,10 +193,7 @@ def _multiply_frames(
     origin = wp.transform_point(outer, wp.transform_get_translation(inner))
     product = product + wp.dot(origin, wp.vec3(by_sources[s, 1], by_sources[s, 2], by_sources[s, 3]))
     turn = wp.vec3(by_sources[s, 4], by_sources[s, 5], by_sources[s, 6])
-    for k in range(3):
-        unit = wp.vec3(float(k == 0), float(k == 1), float(k == 2))
-        axis = wp.transform_vector(outer, wp.transform_vector(inner, unit))
-        product = product + 0.5 * wp.dot(axis, wp.cross(turn, wp.transform_vector(frames[s], unit)))
+    product = product + _rotation_product(outer, inner, wp.transform_get_rotation(frames[s]), turn)
     products_out[s] = product
 
 
