@@ -31,6 +31,7 @@ VIEWS = {
     "compass_swarm": (0.6, 0.0, 0.8),
     "levitation": (0.55, -0.75, 0.15),
     "sorter": (0.35, -0.9, 0.1),
+    "trap": (0.0, 0.4, 1.0),
     "worlds": (0.3, -0.9, 0.12),
 }
 """Directions from the bodies to the camera, where they are not those of the command."""

@@ -22,6 +22,7 @@ SMALL = {
     "connectors": "--num-frames 40",
     "levitation": "--num-frames 30",
     "sorter": "--coils 2 --num-frames 24",
+    "trap": "--num-frames 100",
     "worlds": "--world-count 32 --num-frames 15",
 }
 
