@@ -1,5 +1,6 @@
 """The documents: their Python runs, what they say of schemas and commands is so, and every public name is described."""
 
+import doctest
 import importlib.util
 import re
 import runpy
@@ -33,6 +34,13 @@ SLOW = (
     *(f"tutorials/{name}.md" for name in ("blender", "coils", "robot")),
 )
 """Pages that take long, most of them to compile kernels that no other test needs; ``.ci/run`` runs them, too."""
+
+WITH_EXAMPLE = {
+    *("h_field", "wrench", "solve_induction", "sweep", "material", "MagnetizationCurve", "register_custom_attributes"),
+    *("add_inducible", "add_permanent", "add_balls", "add_coil", "add_field_map", "Magnetics", "Simulation", "check"),
+}
+"""Public names whose docstring has an example that runs. Other names need a viewer, a finished run or a time-sampled
+stage: their pages have programs."""
 
 
 def program(page: Path) -> str:
@@ -81,10 +89,25 @@ def test_notebooks_follow_their_pages(page):
 
 
 def test_every_public_name_is_described():
-    described = re.findall(
-        r"^\.\. auto\w+:: warpmag\.(\w+)$", (DOCS / "api.md").read_text(encoding="utf-8"), re.MULTILINE
-    )
+    text = "".join(page.read_text(encoding="utf-8") for page in (DOCS / "api").glob("*.md"))
+    described = re.findall(r"^\.\. auto\w+:: warpmag\.(\w+)$", text, re.MULTILINE)
     assert {*described, "register_attributes"} >= set(warpmag.__all__)
+
+
+def test_examples_of_public_docstrings_run(tmp_path, monkeypatch):
+    """Examples of functions, classes and their methods; ``lift.usda`` is the stage of the page on stages."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(wp.config, "log_level", wp.LOG_WARNING)  # no lines of modules among the results
+    text = (DOCS / "howto" / "stages.md").read_text(encoding="utf-8")
+    (tmp_path / "lift.usda").write_text(next(FILE.finditer(text))[1], encoding="utf-8")
+    finder, runner, run = doctest.DocTestFinder(), doctest.DocTestRunner(), set()
+    with wp.ScopedDevice("cpu"):
+        for name in warpmag.__all__:
+            for example in finder.find(getattr(warpmag, name), name, module=False, globs={}):
+                if example.examples:
+                    assert runner.run(example).failed == 0, f"{example.name}: see the output above"
+                    run.add(example.name.partition(".")[0])
+    assert run >= WITH_EXAMPLE
 
 
 @pytest.mark.long

@@ -48,6 +48,12 @@ class MagnetizationCurve:
         magnetizations: Magnetization M at the points [A/m], never falling, from 0.
         saturation: Saturation magnetization Ms [A/m], the limit beyond the last point.
         name: Name of the curve in messages.
+
+    Example:
+        >>> import warpmag
+        >>> steel = warpmag.MagnetizationCurve.from_bh([0, 200, 1e3, 1e4, 1e5], [0, 0.6, 1.35, 1.8, 2.1])
+        >>> float(steel.fields[-1])  # A/m
+        100000.0
     """
 
     fields: tuple[float, ...]

@@ -109,6 +109,11 @@ def material(name: str) -> Material:
 
     Raises:
         InputError: There is no such material; the message lists all names.
+
+    Example:
+        >>> import warpmag
+        >>> warpmag.material("N42").density  # kg/m³
+        7500.0
     """
     return _look_up("material", name)
 

@@ -88,6 +88,15 @@ def add_balls(
 
     Raises:
         InputError: The attributes are not declared, a position or a value is out of range, or lengths of arrays differ.
+
+    Example:
+        >>> import newton
+        >>> import warpmag
+        >>> builder = newton.ModelBuilder()
+        >>> warpmag.register_custom_attributes(builder)
+        >>> balls = warpmag.add_balls(builder, [[0, 0, 0.01], [0, 0, 0.03]], radius=0.005, saturation=1.7e6)
+        >>> len(balls.bodies)
+        2
     """
     check_registered(builder)
     poses = _poses(positions, orientations)

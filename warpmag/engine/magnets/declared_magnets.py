@@ -72,7 +72,14 @@ def add_inducible(
         UnitWarning: A ball is so large that its radius is likely in another unit.
 
     Example:
-        >>> add_inducible(builder, body="*/ball_*", material="iron")  # doctest: +SKIP
+        >>> import newton
+        >>> import warpmag
+        >>> builder = newton.ModelBuilder()
+        >>> warpmag.register_custom_attributes(builder)
+        >>> ball = builder.add_body(label="tray/ball_1")
+        >>> shape = builder.add_shape_sphere(ball, radius=0.005)
+        >>> warpmag.add_inducible(builder, body="*/ball_*", material="iron") == [shape]
+        True
     """
     numbers = {"saturation": saturation, "susceptibility": susceptibility}
     values = materials.inducible_from(material, curve, {k: v for k, v in numbers.items() if v is not None})
@@ -133,7 +140,14 @@ def add_permanent(
             another unit.
 
     Example:
-        >>> add_permanent(builder, body="gripper", remanence=1.3, direction=(0.0, 0.0, 1.0))  # doctest: +SKIP
+        >>> import newton
+        >>> import warpmag
+        >>> builder = newton.ModelBuilder()
+        >>> warpmag.register_custom_attributes(builder)
+        >>> gripper = builder.add_body(label="gripper")
+        >>> shape = builder.add_shape_box(gripper, hx=0.01, hy=0.01, hz=0.01)
+        >>> warpmag.add_permanent(builder, body="gripper", remanence=1.3, direction=(0.0, 0.0, 1.0)) == [shape]
+        True
     """
     vector = materials.magnetization_from(magnetization, remanence, material, direction)
     values = {"moment_spacing": moment_spacing, "conductivity": conductivity}

@@ -76,6 +76,15 @@ def add_coil(
 
     Raises:
         InputError: The attributes are not declared, not exactly one body is selected, or a value is out of range.
+
+    Example:
+        >>> import newton
+        >>> import warpmag
+        >>> builder = newton.ModelBuilder()
+        >>> warpmag.register_custom_attributes(builder)
+        >>> coil = warpmag.add_coil(builder, radius=0.01, ampere_turns=500.0, label="lift")
+        >>> builder.shape_label[coil]
+        'lift'
     """
     corners = ()
     if points is not None:
@@ -121,6 +130,15 @@ def add_field_map(
 
     Raises:
         InputError: The attributes are not declared, not exactly one body is selected, or a value is out of range.
+
+    Example:
+        >>> import newton
+        >>> import warpmag
+        >>> builder = newton.ModelBuilder()
+        >>> warpmag.register_custom_attributes(builder)
+        >>> import numpy as np
+        >>> earth = np.broadcast_to([0.0, 16.0, -35.0], (2, 2, 2, 3))  # A/m
+        >>> field_map = warpmag.add_field_map(builder, origin=(-5.0, -5.0, -5.0), spacing=10.0, values=earth)
     """
     name = "add_field_map"
     nodes, steps = host_array(f"{name}: values", values), host_array(f"{name}: spacing", spacing)

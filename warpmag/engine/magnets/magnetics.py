@@ -68,6 +68,21 @@ class Magnetics:
         shape_volumes: Magnetic volume of each of these shapes [m³], shape [n]. Where shapes of one body overlap, the
             common volume belongs to the first of them.
         coils: The coils with voltages, None without any: their ``labels``, and on the device their ``currents`` [A].
+
+    Example:
+        >>> import newton
+        >>> import warpmag
+        >>> builder = newton.ModelBuilder()
+        >>> warpmag.register_custom_attributes(builder)
+        >>> ball = builder.add_body()
+        >>> shape = builder.add_shape_sphere(ball, radius=0.005)
+        >>> marked = warpmag.add_inducible(builder, body=ball, material="iron")
+        >>> coil = warpmag.add_coil(builder, radius=0.02, ampere_turns=500.0, xform=((0, 0, 0.02), (0, 0, 0, 1)))
+        >>> model = builder.finalize(device="cpu")
+        >>> magnetics, state = warpmag.Magnetics(model), model.state()
+        >>> magnetics.apply(state)
+        >>> bool(state.body_f.numpy()[ball, 2] > 0.0)  # the coil attracts the ball
+        True
     """
 
     @renamed_arguments(step="dt")

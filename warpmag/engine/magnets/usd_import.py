@@ -27,6 +27,16 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
 
     Args:
         builder: The builder; declaring twice does nothing.
+
+    Example:
+        >>> import newton
+        >>> import warpmag
+        >>> builder = newton.ModelBuilder()
+        >>> warpmag.register_custom_attributes(builder)
+        >>> ball = builder.add_body()
+        >>> shape = builder.add_shape_sphere(ball, radius=0.005)
+        >>> warpmag.add_inducible(builder, body=ball, material="iron") == [shape]
+        True
     """
     declare_attributes(builder, usd_value=_attribute_value)
     name, functions = "source_prim", {"usd_prim_filter": _is_source, "usd_entry_expander": _add_sources}

@@ -75,6 +75,19 @@ class Simulation:
         step_size: Time step [s].
         frame_rate: Output frames per second [Hz].
         frame_count: Output frames of the stage after the first; None if it has no time range.
+
+    Example:
+        >>> import newton
+        >>> import warpmag
+        >>> builder = newton.ModelBuilder()
+        >>> warpmag.register_custom_attributes(builder)
+        >>> ball = builder.add_body()
+        >>> shape = builder.add_shape_sphere(ball, radius=0.005)
+        >>> marked = warpmag.add_inducible(builder, body=ball, material="iron")
+        >>> simulation = warpmag.Simulation(builder, dt=1e-3, device="cpu")
+        >>> simulation.step()
+        >>> round(simulation.time, 6)  # s
+        0.001
     """
 
     @renamed_arguments(step="dt")

@@ -73,6 +73,12 @@ def check(path: str | os.PathLike) -> StageReport:
 
     Raises:
         InputError: The file cannot be opened as a stage.
+
+    Example:
+        >>> import warpmag
+        >>> report = warpmag.check("lift.usda")  # a stage with a ball below a magnet
+        >>> report.errors
+        ()
     """
     stage, deferred = open_deferred(path)
     with usd_errors(str(path)):
