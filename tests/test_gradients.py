@@ -227,6 +227,33 @@ def test_a_gradient_that_is_not_finite_raises(device):
         tape.backward()
 
 
+def test_wrong_points_of_a_curve_raise(device):
+    h, m = [1e3, 1e4, 2e4], [1e5, 2e5, 2e5]
+
+    def solve(points, **more):
+        return warpmag.solve_induction(
+            [[0.0, 0.0, 0.0]], 0.005, curve_points=points, external_field=(0, 0, 1e5), device=device, **more
+        )
+
+    for message, points, more in (
+        ("curve_points: replace curve", (h, m), {"curve": "1010-steel"}),
+        ("curve_points: must be", h, {}),
+        ("curve_points: 3 fields, but 2", (h, m[:2]), {}),
+        ("saturation: a measured curve has its own", (h, m), {"saturation": 1e6}),
+    ):
+        with pytest.raises(warpmag.InputError, match=message):
+            solve(points, **more)
+    with wp.Tape() as tape:
+        position = wp.array([[0.0, 0.0, 0.0]], dtype=wp.vec3d, device=device)
+        points = h, warp_array(m, device)
+        result = warpmag.solve_induction(position, 0.005, curve_points=points, external_field=(0, 0, 1e5))
+    result.magnetizations.grad.fill_(1.0)
+    with pytest.raises(
+        warpmag.InputError, match="curve_points: at H = 10000 and 20000 A/m the magnetization is the same"
+    ):
+        tape.backward()
+
+
 def test_nothing_is_recorded_without_need(device):
     x, m, radii = scene()
     with wp.Tape() as tape:
