@@ -38,6 +38,7 @@ SLOW = (
 WITH_EXAMPLE = {
     *("h_field", "wrench", "solve_induction", "sweep", "material", "MagnetizationCurve", "register_custom_attributes"),
     *("add_inducible", "add_permanent", "add_balls", "add_coil", "add_field_map", "Magnetics", "Simulation", "check"),
+    "SensorMagnetometer",
 }
 """Public names whose docstring has an example that runs. Other names need a viewer, a finished run or a time-sampled
 stage: their pages have programs."""

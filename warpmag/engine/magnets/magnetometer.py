@@ -18,20 +18,28 @@ from warpmag.kernels.rigid.sources import Sites, find_sites, read_sites
 class SensorMagnetometer:
     """Magnetometers at sites of a model, such as compasses and Hall sensors: flux density in the frames of the sites.
 
-    ::
-
-        builder.add_site(body, label="compass")
-        ...
-        magnetometer = warpmag.SensorMagnetometer(model, magnetics, sites="compass*", noise=1e-7)
-        magnetics.apply(state)
-        magnetometer.update(state)
-        flux_density = magnetometer.flux_density.numpy()
-
     The readings include the external field and all magnets of the world, also magnets of the sensor's own body.
 
     Attributes:
         flux_density: Readings B [T] in the frames of the sites, vectors on the device, shape [s].
         sites: Shape indices of the sites, [s].
+
+    Example:
+        >>> import newton
+        >>> import warpmag
+        >>> builder = newton.ModelBuilder()
+        >>> warpmag.register_custom_attributes(builder)
+        >>> magnet = builder.add_body()
+        >>> shape = builder.add_shape_sphere(magnet, radius=0.01)
+        >>> marked = warpmag.add_permanent(builder, body=magnet, magnetization=(0.0, 0.0, 9e5))
+        >>> site = builder.add_site(-1, xform=((0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)), label="compass")
+        >>> model = builder.finalize(device="cpu")
+        >>> magnetics, state = warpmag.Magnetics(model), model.state()
+        >>> magnetics.apply(state)
+        >>> compass = warpmag.SensorMagnetometer(model, magnetics, sites="compass*")
+        >>> compass.update(state)
+        >>> round(float(compass.flux_density.numpy()[0, 2]), 6)  # T: μ0 m/(2π d³)
+        0.000754
     """
 
     def __init__(
