@@ -17,11 +17,11 @@ namespace warpmag {
 constexpr Real SMALLER = Real(0.999); // ratio of volumes from which a box counts as smaller than another one
 
 // Boxes of cells: half sides, rotation to the world as quaternion, volume, the size that scales the window, and the
-// radius of the ball of the same volume. Balls have half sides for the windows only.
+// radius of the ball of the same volume. Balls have half sides for the windows only. ``linear`` boxes have differences.
 struct Boxes {
     Vector half;
     Number q[4], volume, size, radius;
-    Mask ball;
+    Mask ball, linear;
 };
 
 // Pose of box j relative to box i: separation, and rotation from the frame of j to that of i.
@@ -48,13 +48,14 @@ CUDA_CALLABLE inline Window window_between(Number d, Real begin, Real end, Mask 
 
 // A pair of boxes in units of ``1/unit``: half sides, separation r from i to j, rotation of j in the frame of i, radii
 // of the balls, the window of all boxes, and that of close boxes. ``own_points``: the Gauss points are those of i.
-// ``of_ball``: the other one of the pair, the source, is a ball; ``at_ball``: the one with the points is.
+// ``of_ball``: the other one of the pair, the source, is a ball; ``at_ball``: the one with the points is. ``linear``: one
+// of the two has differences.
 struct BoxPair {
     Vector half, other_half, r;
     Rotation<Number> rotation;
     Number unit, radius, other_radius;
     Window window, close;
-    Mask own_points, of_ball, at_ball;
+    Mask own_points, of_ball, at_ball, linear;
 };
 CUDA_CALLABLE inline Number longest(Vector half) { return larger(half.x, larger(half.y, half.z)); }
 CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, const RelativePose& pose, Mask listed,
@@ -76,7 +77,8 @@ CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, cons
             close,
             own_points,
             own_points ? other.ball : own.ball,
-            own_points ? own.ball : other.ball};
+            own_points ? own.ball : other.ball,
+            own.linear | other.linear};
 }
 
 // Calls visit(p, signs) for 2³ Gauss points of a box of half sides h, which have equal weights. The signs tell the half
@@ -208,14 +210,16 @@ struct PairMatrices {
 CUDA_CALLABLE inline PairMatrices boxes_matrices(const BoxPair& p) {
     const SourceAndTarget s(p);
     const Number zero = p.unit * Real(0);
-    PairMatrices sums; // rows in the frame of the target, columns in that of the source
+    const bool linear = any(p.linear); // half of a uniform box is half of its field
+    PairMatrices sums;                 // rows in the frame of the target, columns in that of the source
     for (int k = 0; k < 9; ++k)
         sums.means[k] = sums.of_differences[k] = sums.at_differences[k] = sums.differences[k] = zero;
     for_gauss_points(s.target_half, [&](Vector x, const Real* signs) {
         const Vector at = s.center + to_world(s.rotation, x);
         const Symmetric full = s.tensor(at);
         for (int l = 0; l < 3; ++l) {
-            const Vector of_upper = column(s.upper_half_tensor(at, l), l), of_both = column(full, l);
+            const Vector of_both = column(full, l);
+            const Vector of_upper = linear ? column(s.upper_half_tensor(at, l), l) : Real(0.5) * of_both;
             const Vector mean = to_body(s.rotation, of_both), difference = to_body(s.rotation, 2 * of_upper - of_both);
             const Number by_mean[3] = {mean.x, mean.y, mean.z},
                          by_difference[3] = {difference.x, difference.y, difference.z};
@@ -370,6 +374,7 @@ CUDA_CALLABLE inline Wrench boxes_wrench(const BoxPair& p, const PairMoments& mo
         };
         const Vector mean = of_source - at_source;
         add(s.push(at, mean, here), s.tensor(at) * mean);
+        if (!any(p.linear)) return;
         add_half(0, {2 * at_source.x, zero, zero});
         add_half(1, {zero, 2 * at_source.y, zero});
         add_half(2, {zero, zero, 2 * at_source.z});

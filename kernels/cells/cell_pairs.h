@@ -130,15 +130,17 @@ template <class Pairs> struct PairReader {
         const size_t cells = a.half.strides[0] / sizeof(Real);
         Boxes b;
         b.half = {gather(a.half.data, c.at), gather(a.half.data + cells, c.at), gather(a.half.data + 2 * cells, c.at)};
-        int body[WIDTH], is_box[WIDTH], none[WIDTH] = {};
+        int body[WIDTH], is_box[WIDTH], is_linear[WIDTH], none[WIDTH] = {};
         for (int l = 0; l < WIDTH; ++l) {
             body[l] = 4 * a.body.data[c.at[l]];
             is_box[l] = a.body.data[c.at[l]] < a.grid.shape[0];
+            is_linear[l] = a.linear.data[a.body.data[c.at[l]]];
         }
         const Real* const frames = (const Real*)a.frame.data;
         for (int k = 0; k < 4; ++k) b.q[k] = gather(frames + k, body);
         b.radius = row(3, c);
         b.ball = mask_of(indices(is_box) == indices(none));
+        b.linear = mask_of(indices(none) < indices(is_linear));
         b.volume = b.ball ? BALL * b.radius * b.radius * b.radius : 8 * b.half.x * b.half.y * b.half.z;
         b.size = gather(a.half.data + 3 * cells, c.at);
         return b;

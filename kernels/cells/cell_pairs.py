@@ -73,6 +73,7 @@ def cell_pairs_type(dtype):
         body: wp.array[int]  # index of the body of each cell, b for balls, shape [n]
         half: wp.array2d[dtype]  # half sides of the boxes in the frame of the body's grid, and sizes [m], shape [4, n]
         grid: wp.array[quaternion]  # from the frame of each body's grid to that of the body, shape [b]
+        linear: wp.array[int]  # 1 for bodies of linear cells, 0 for balls, shape [b + 1]
         inducible: wp.array[int]  # 1 for inducible moments, shape [n]
         movable: wp.array[int]  # 1 where the force is evaluated, shape [n]
         rotatable: wp.array[int]  # 1 where the torque is evaluated, too, shape [n]
@@ -239,6 +240,7 @@ class CellPairs:
         quaternion = wp.types.quaternion(dtype)
         a.group, a.body, a.half, a.movable = put(group), put(body), put(half, dtype), put(layout.movable)
         a.rotatable, a.inducible = rotatable, put(~layout.permanent)
+        a.linear = put([*(coupling.slopes is not None for _, coupling in bodies), False])
         a.grid, a.rotation = put([coupling.grid_rotation for _, coupling in bodies], quaternion), cells.rotations
         a.packed, a.h, a.forces, a.torques = packed.packed, h, forces, torques
         a.means, a.differences, a.difference_field = cells.means, cells.differences, cells.difference_field

@@ -364,6 +364,7 @@ template <Quantity Q> inline void sum_share(const Share& share) {
     Tile tile;
     TargetTile targets;
     for (const TileEntry* entry = share.begin; entry < share.end; ++entry) {
+        if (entry->row_begin == entry->row_end) continue; // of a world that rests
         if (entry->mirrored) {
             if constexpr (MUTUAL<Q>) sum_mirrored<Q>(share, *entry, targets, tile);
         } else {

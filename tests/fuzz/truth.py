@@ -4,6 +4,7 @@ Nothing of warpmag's own reader is used: bodies, poses, sizes, masses, frictions
 """
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import newton
@@ -167,7 +168,48 @@ class Reading:
                 if (volume is None or self.is_ambiguous(one)) and not own:
                     return None
                 total += own or volume * self.density(one)
-        return total
+        masses = list(self.instanced_masses(body))
+        return None if None in masses else total + sum(masses)
+
+    def instanced_masses(self, body) -> Iterator[float | None]:
+        """Masses of colliders of instances that move with a body, None where they are not known here."""
+        for instancer in self.instancers:
+            if self.above(instancer.GetPrim()) != body:
+                continue
+            targets, kind = instancer.GetPrototypesRel().GetForwardedTargets(), UsdGeom.PointInstancer
+            placed = instancer.ComputeInstanceTransformsAtTime(
+                self.time, self.time, kind.IncludeProtoXform, kind.IgnoreMask
+            )
+            indices = instancer.GetProtoIndicesAttr().Get(self.time) or ()
+            inactive = instancer.GetPrim().GetMetadata("inactiveIds")
+            inactive = set(inactive.GetAppliedItems()) if inactive else set()
+            ids = instancer.GetIdsAttr().Get(self.time) or range(len(indices))
+            for number, index, matrix in zip(ids, indices, placed, strict=True):
+                if number not in inactive:
+                    size = np.linalg.norm(np.array(matrix)[:3, :3] @ self.world(instancer.GetPrim())[:3, :3], axis=1)
+                    yield from self._masses_within(self.stage.GetPrimAtPath(targets[index]), body, size)
+
+    def _masses_within(self, root, body, size) -> Iterator[float | None]:
+        """Masses of the colliders below the root of a prototype, of scale ``size``, which have no body of their own."""
+        prims = iter(Usd.PrimRange(root, Usd.TraverseInstanceProxies(Usd.PrimAllPrimsPredicate)))
+        for prim in prims:
+            schemas = prim.GetAppliedSchemas()
+            if "PhysicsRigidBodyAPI" in schemas and self.get(prim, "physics:rigidBodyEnabled", True):
+                prims.PruneChildren()
+            elif prim.IsA(UsdGeom.PointInstancer):
+                prims.PruneChildren()
+                yield None
+            elif "PhysicsCollisionAPI" in schemas and self.get(prim, "physics:collisionEnabled", True):
+                scale = np.abs(np.linalg.det(self.world(root)[:3, :3]))
+                volume, known = (
+                    self.volume(prim),
+                    not UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0],
+                )
+                known = known and "PhysicsMassAPI" not in body.GetAppliedSchemas() and np.ptp(size) <= 1e-4 * size.max()
+                own = self.own_mass(prim)
+                yield own or (
+                    volume * size.prod() / scale * self.density(prim) if known and volume is not None else None
+                )
 
 
 def not_finite(stage) -> list[str]:
