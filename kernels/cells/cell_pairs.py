@@ -18,7 +18,6 @@ import warp as wp
 from warpmag.kernels.pairs import neighbors
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
-from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
 WINDOW = 2.5, 3.5
@@ -59,6 +58,8 @@ _BINS = 256
 """Bins of rows by their numbers of candidates; as in ``cell_pairs.h``."""
 _CELLS_PER_THREAD = 100
 """Fewest cells per thread of a CPU."""
+_GROUP = 32
+"""Threads of a GPU that share the candidates of a cell: a large cell among small ones has thousands."""
 
 
 @cache
@@ -266,7 +267,7 @@ class CellPairs:
     def _record(self, first: int, last: int) -> list:
         """Return launches of passes ``first`` to ``last``: one on a CPU, one each on a GPU."""
         pairs, device = self._pairs, self._pairs.h.device
-        group, rows = group_threads(device), max(pairs.cell.shape[0], pairs.group.shape[0], _BINS)
+        group, rows = _GROUP if device.is_cuda else 1, max(pairs.cell.shape[0], pairs.group.shape[0], _BINS)
         kernel = _kernel(pairs.packed.dtype, group)
         sizes = dict(threads=threads_for(rows, _CELLS_PER_THREAD), gpu_threads=group * rows)
         ranges = [(k, k + 1) for k in range(first, last + 1)] if device.is_cuda else [(first, last + 1)]

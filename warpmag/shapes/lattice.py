@@ -2,10 +2,10 @@
 
 A body that is not a ball is replaced by moments of volume Vᵢ at xᵢ. ΣVᵢ is the volume of the body, and ΣVᵢxᵢ/ΣVᵢ its
 centroid. Nearly cubic cells divide the bounding box of each shape exactly. The moment of a cell is at the centroid of
-the part that the shape fills. Cells filled by less than a third join their nearest neighbor, so that a curved surface
-has neither steps nor slivers. The grid of a single mesh fits its steps, such as the strokes of a letter, where it can.
-The filled part is found from a fine grid of test points. Where shapes of a body overlap, each test point counts
-once.
+the part that the shape fills. Cells filled by less than a third, or a half in a body of several shapes, join their
+nearest neighbor, so that a curved surface has neither steps nor slivers. The grid of a single mesh fits its steps, such
+as the strokes of a letter, where it can. The filled part is found from a fine grid of test points. Where shapes of a
+body overlap, each test point counts once.
 
 The accuracy determines :data:`AUTOMATIC_COUNT`. The table lists errors of a uniformly magnetized cube of side L as n³
 point dipoles. The field's error is a relative L2 norm over all points at distance d from the surface. The force acts on
@@ -66,9 +66,11 @@ LONGEST = 1.25
 """Largest ratio of a cell's longest side to the next one at automatic spacing. Longer cells are poor dipoles along a
 rod."""
 
-_JOINED = 0.35
-"""Share of a whole cell below which a cell joins a neighbor. Joined cells are not boxes, as which cells of different
-bodies act on each other. At a half the forces in a stack of five discs were wrong by factors of 2 to 4."""
+_JOINED = 0.35, 0.5
+"""Shares of a whole cell below which a cell joins a neighbor, in bodies of one shape and of several. Joined cells are
+not boxes, as which cells of different bodies act on each other: at a half, forces in a stack of five discs were wrong
+by factors of 2 to 4. Several shapes share cells, so a third would leave many small parts."""
+
 _STEP = 1.02
 """Ratio of successive trial spacings."""
 
@@ -345,21 +347,22 @@ def _fill_part(cells: CellGrid, k: int) -> tuple[np.ndarray, np.ndarray, Pieces]
     part, filled = cells.solids[k], cells.filled(k)
     if filled.point_count == 0:
         raise InputError(f"{part.name}: too thin to be filled with moments")
-    positions, weights, (piece, moment, share) = _joined(filled) if len(filled.index) else _NO_MOMENTS
+    least = _JOINED[len(cells.solids) > 1]
+    positions, weights, (piece, moment, share) = _joined(filled, least) if len(filled.index) else _NO_MOMENTS
     if filled.weights.sum() == filled.point_count:  # no overlap: the exact centroid is known
         positions = positions + part.to_body(part.centroid[None]) - weights @ positions / weights.sum()
     pieces = Pieces(cells.sides, filled.index, filled.shares, piece, moment, share, cells.position, cells.rotation)
     return positions @ cells.rotation.T + cells.position, weights * (part.volume / filled.point_count), pieces
 
 
-def _joined(filled: Filled) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
+def _joined(filled: Filled, least: float) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
     """Return centroids and weights of the moments, and (cell, moment, share of the cell that belongs to the moment).
 
-    Cells filled by less than :data:`_JOINED` of the fullest one join their nearest neighbors.
+    Cells filled by less than ``least`` of the fullest one join their nearest neighbors.
     """
     hits, sums = filled.weights, filled.sums
     centroids = sums / hits[:, None]
-    full = hits >= _JOINED * hits.max()
+    full = hits >= least * hits.max()
     weights, moments = hits[full], sums[full]
     scattered = np.flatnonzero(~full)
     joined = [(np.flatnonzero(full), np.arange(len(weights)), np.ones(len(weights)))]
