@@ -48,8 +48,8 @@ CUDA_CALLABLE inline Window window_between(Number d, Real begin, Real end, Mask 
 
 // A pair of boxes in units of ``1/unit``: half sides, separation r from i to j, rotation of j in the frame of i, radii
 // of the balls, the window of all boxes, and that of close boxes. ``own_points``: the Gauss points are those of i.
-// ``of_ball``: the other one of the pair, the source, is a ball; ``at_ball``: the one with the points is. ``linear``: one
-// of the two has differences.
+// ``of_ball``: the other one of the pair, the source, is a ball; ``at_ball``: the one with the points is. ``linear``:
+// one of the two has differences.
 struct BoxPair {
     Vector half, other_half, r;
     Rotation<Number> rotation;
