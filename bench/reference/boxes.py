@@ -84,15 +84,15 @@ def pair_correction(a, b, window, close) -> np.ndarray:
     return fade(distance, window) * tensor
 
 
-def body_corrections(cells, bodies, window, close, hardening: float, steepness: float) -> np.ndarray:
+def body_corrections(cells, bodies, window, close, overlap_demagnetization: float, full_depth: float) -> np.ndarray:
     """Tensors between cells of different bodies [1/m³], shape [n, 3, n, 3]: H_i is the sum of T_ij m_j.
 
     Args:
         cells: Position [m], rotation matrix and half sides [m] of each cell.
         bodies: Body of each cell, shape [n].
         window, close: As for :func:`pair_correction`.
-        hardening: Demagnetizing factor added to a cell inside another body.
-        steepness: Inverse depth from which a cell gets all of it.
+        overlap_demagnetization: Demagnetizing factor added to a cell inside another body.
+        full_depth: Depth from which a cell gets all of it.
     """
     n, tensors, depth = len(cells), np.zeros((len(cells), 3, len(cells), 3)), np.zeros(len(cells))
     for i, j in itertools.combinations(range(n), 2):
@@ -101,6 +101,6 @@ def body_corrections(cells, bodies, window, close, hardening: float, steepness: 
             inscribed = cells[i][2].min() + cells[j][2].min()
             depth[[i, j]] += max(1.0 - np.linalg.norm(cells[i][0] - cells[j][0]) / inscribed, 0.0)
     volumes = np.array([8.0 * half.prod() for _, _, half in cells])
-    hardness = hardening * np.minimum(steepness * depth, 1.0) / volumes
-    tensors[np.arange(n), :, np.arange(n)] -= hardness[:, None, None] * np.eye(3)
+    overlap_factor = overlap_demagnetization * np.minimum(depth / full_depth, 1.0) / volumes
+    tensors[np.arange(n), :, np.arange(n)] -= overlap_factor[:, None, None] * np.eye(3)
     return tensors

@@ -5,9 +5,9 @@
 // Rows are in the frame of box i and columns in that of box j: a box's axes are the axes of its body's grid. They are
 // computed again when the relative pose of their bodies has changed.
 //
-// From Python: HARDENING, the demagnetizing factor added to a cell inside another body, and STEEPNESS, its inverse
-// depth for all of it; MARGIN, by how many radii a cell may move before candidates are searched again; MU0; and the
-// constants of ``box_pair.h``.
+// From Python: OVERLAP_DEMAGNETIZATION, the demagnetizing factor added to a cell inside another body, and
+// FULL_OVERLAP_DEPTH, the depth from which it gets all of it; MARGIN, by how many radii a cell may move before
+// candidates are searched again; MU0; and the constants of ``box_pair.h``.
 // ``CellPairs`` is the struct of cell_pairs.py.
 #pragma once
 #include "cells/box_pair.h"
@@ -232,8 +232,8 @@ template <class Pairs> CUDA_CALLABLE inline void tabulate(const Pairs& a, int ro
         put_moved(detail + 9 * CHUNK, matrices.at_differences, 9, factor, moved, near);
         put_moved(detail + 18 * CHUNK, matrices.differences, 9, factor, moved, near);
     }
-    depth = smaller(STEEPNESS * group_sum(depth), depth * Real(0) + 1);
-    if (share() == 0) put(a.hardness.data + row, HARDENING * depth / box.volume);
+    depth = smaller(group_sum(depth) / FULL_OVERLAP_DEPTH, depth * Real(0) + 1);
+    if (share() == 0) put(a.overlap_factor.data + row, OVERLAP_DEMAGNETIZATION * depth / box.volume);
 }
 
 // Adds vectors times ``scale`` to an array of vectors, for cells with candidates.
@@ -271,8 +271,8 @@ template <class Pairs> CUDA_CALLABLE inline void add_field(const Pairs& a, int r
         h += matrix_times(detail, d);
         g += matrix_times(detail + 9 * CHUNK, m) + matrix_times(detail + 18 * CHUNK, d);
     }
-    const Number hardness = numbers(a.hardness.data + row);
-    h = group_sums(h) - hardness * vectors_of(means, own);
+    const Number overlap_factor = numbers(a.overlap_factor.data + row);
+    h = group_sums(h) - overlap_factor * vectors_of(means, own);
     g = group_sums(g);
     for (int l = 0; l < WIDTH; ++l) counts[l] = a.inducible.data[own.at[l]] ? counts[l] : 0;
     add_to_cells((Real*)a.h.data, own, counts, to_world(frame, h), 1);

@@ -30,11 +30,11 @@ a surface cuts off, of little volume."""
 CLOSE = 1.75, 2.25
 """Distances at which the average over close boxes turns into their quadrupoles, in means of their sizes, too. In means
 of their longest sides the operator of a stack of five sheets would have an eigenvalue of -0.0025."""
-HARDENING = 0.45
+OVERLAP_DEMAGNETIZATION = 0.45
 """Demagnetizing factor added to a cell inside another body. Quadrature over intersecting boxes leaves eigenvalues of
 -0.05."""
-STEEPNESS = 2.0
-"""Depth inside other bodies from which a cell gets it whole: inverse, over the sum of the inscribed radii."""
+FULL_OVERLAP_DEPTH = 0.5
+"""Depth inside other bodies from which a cell gets all of it, over the sum of the inscribed radii."""
 _LONGEST_LIST = 2048
 """Longest list of candidates. A face cell of a cube has 50 to 60, one in a stack of five sheets up to 500."""
 _LONGEST_CLOSE = 192
@@ -103,9 +103,7 @@ def cell_pairs_type(dtype):
         bin_end: wp.array[int]  # end of each bin's rows, shape [BINS]
         cell: wp.array[int]  # cell of each row, shape [c padded]
         pose: wp.array[dtype]  # relative pose of each tensor, shape [c padded / CHUNK, capacity, 7, CHUNK], flat
-        hardness: wp.array[
-            dtype
-        ]  # demagnetizing factor added where bodies intersect, over the volume [1/m³], shape [c padded]
+        overlap_factor: wp.array[dtype]  # demagnetizing factor of overlaps over the volume [1/m³], shape [c padded]
         matrix: wp.array[dtype]  # T_ij of means [1/m³], shape [c padded / CHUNK, capacity, 9, CHUNK], flat
         detail: wp.array[dtype]  # of, at and between differences [1/m³], [c padded / CHUNK, close_capacity, 27, CHUNK]
 
@@ -116,8 +114,8 @@ def cell_pairs_type(dtype):
 def _kernel(dtype, group: int):
     arguments = {**PASS_ARGUMENTS, "arrays": cell_pairs_type(dtype)}
     constants = dict(
-        HARDENING=HARDENING,
-        STEEPNESS=STEEPNESS,
+        OVERLAP_DEMAGNETIZATION=OVERLAP_DEMAGNETIZATION,
+        FULL_OVERLAP_DEPTH=FULL_OVERLAP_DEPTH,
         CLOSE_BEGIN=CLOSE[0],
         CLOSE_END=CLOSE[1],
         WINDOW_BEGIN=WINDOW[0],
@@ -253,7 +251,7 @@ class CellPairs:
         )
         self.crowded = a.crowded = zeros(1)
         a.rows, a.bin, a.bin_end = zeros(1), zeros(n), zeros(_BINS)
-        a.cell, a.hardness = zeros(padded), zeros(padded, kind=dtype)
+        a.cell, a.overlap_factor = zeros(padded), zeros(padded, kind=dtype)
         a.pose = _large_zeros(padded * capacity * _POSE_ROWS, dtype, device)
         a.close_capacity, a.close_count = min(capacity, _LONGEST_CLOSE), zeros(n)
         a.matrix = _large_zeros(padded * capacity * _MATRIX_ROWS, dtype, device)
@@ -287,17 +285,17 @@ class CellPairs:
 
     def add_field(self):
         """Add the corrections to the field, and the fields of differences to the cells' ``difference_field``."""
-        self._cells.spread()
+        self._cells.write_differences()
         for launch in self._field:
             launch.launch()
 
     def add_forces(self):
         """Add the corrections to forces and torques."""
-        self._cells.spread()
+        self._cells.write_differences()
         for launch in self._force:
             launch.launch()
 
     def persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays that the next search and the next evaluation read, by name."""
-        kept = ("rows", "cell", "pose", "matrix", "detail", "hardness", "crowded", "close_count")
+        kept = ("rows", "cell", "pose", "matrix", "detail", "overlap_factor", "crowded", "close_count")
         return neighbors.persistent_lists(self._lists) | {name: getattr(self._pairs, name) for name in kept}

@@ -1,10 +1,11 @@
 // Cells of one body: the differences of their halves, and corrections of the field between them, H_i += Σ T_ij m_j.
 //
-// SPREAD writes the moment of each cell and half the difference D m of its halves (``warpmag.shapes.linear_cells``).
-// SHARE computes the uniform field that the correction C adds to all cells of a body. TURN copies the fields of the
-// differences from an array of vectors to rows of components. ADD adds Dᵀ of these fields, the fields of the tensors,
-// and the uniform field. Where no cell has slopes, the differences are 0. Everything is in the frame of the body's
-// grid. On a CPU a pass works on a vector of cells, on a GPU a group of threads has one cell.
+// DIFFERENCES writes the moment of each cell and half the difference D m of its halves
+// (``warpmag.shapes.linear_cells``). UNIFORM_FIELD computes the uniform field that the correction C adds to all cells
+// of a body. TRANSPOSE copies the fields of the differences from an array of vectors to rows of components. ADD adds
+// Dᵀ of these fields, the fields of the tensors, and the uniform field. Where no cell has slopes, the differences are
+// 0. Everything is in the frame of the body's grid. On a CPU a pass works on a vector of cells, on a GPU a group of
+// threads has one cell.
 // ``Couplings`` is the struct of couplings.py.
 #pragma once
 #include "cells/rotation.h"
@@ -16,7 +17,7 @@ namespace warpmag {
 
 constexpr int TENSOR = 9; // rows of the tensor one after the other
 
-enum CellPass { SPREAD, SHARE, TURN, ADD }; // as in couplings.py
+enum CellPass { DIFFERENCES, UNIFORM_FIELD, TRANSPOSE, ADD }; // as in couplings.py
 
 // Σ T_ij m_j of the cells at ``row`` of the tables. All lists of a chunk have the length of the longest.
 template <class Couplings>
@@ -41,7 +42,7 @@ CUDA_CALLABLE inline Vector sum_entries(const Couplings& c, const Real* const mo
 }
 
 // Uniform field that all cells of a body share: C times the moment of the body.
-template <class Couplings> CUDA_CALLABLE inline void share_field(const Couplings& c, int body) {
+template <class Couplings> CUDA_CALLABLE inline void write_uniform_field(const Couplings& c, int body) {
     const auto& rows = c.rows.data[body]; // range of the body's rows
     const size_t pitch = c.body_moments.strides[0] / sizeof(Real);
     const Number zero = Number(Real(0));
@@ -106,7 +107,7 @@ CUDA_CALLABLE inline Neighbors neighbors_at(const Couplings& c, const CellSpan& 
 }
 
 // Writes moments and half differences in the frame of the grid.
-template <class Couplings> CUDA_CALLABLE inline void spread(const Couplings& c, const CellSpan& at) {
+template <class Couplings> CUDA_CALLABLE inline void write_differences(const Couplings& c, const CellSpan& at) {
     const Rotation<Real> frame = frame_of(c, at);
     const Real* const world = (const Real*)c.moments.data + 3 * (size_t)at.first_moment;
     const Vector m = to_body(frame, vectors((const Real*)c.moments.data + 3 * (size_t)at.i, at.count));
@@ -128,7 +129,7 @@ template <class Couplings> CUDA_CALLABLE inline void spread(const Couplings& c, 
 }
 
 // Writes the fields of differences by rows.
-template <class Couplings> CUDA_CALLABLE inline void turn(const Couplings& c, const CellSpan& at) {
+template <class Couplings> CUDA_CALLABLE inline void transpose_fields(const Couplings& c, const CellSpan& at) {
     if (share() == 0)
         put_row(c.fields, at.row, 0, vectors((const Real*)c.difference_field.data + 3 * (size_t)at.i, at.count));
 }
@@ -155,10 +156,10 @@ template <class Couplings> CUDA_CALLABLE inline Vector gathered(const Couplings&
 template <class Couplings> CUDA_CALLABLE inline void make_cell_pass(const Couplings& c, int pass, int row) {
     const CellSpan at = cell_span(c, row);
     if (at.count == 0) return;
-    if (pass == SPREAD) return spread(c, at);
-    if (pass == TURN) return turn(c, at);
-    if (pass == SHARE) {
-        if (row == c.rows.data[at.body][0]) share_field(c, at.body);
+    if (pass == DIFFERENCES) return write_differences(c, at);
+    if (pass == TRANSPOSE) return transpose_fields(c, at);
+    if (pass == UNIFORM_FIELD) {
+        if (row == c.rows.data[at.body][0]) write_uniform_field(c, at.body);
         return;
     }
     const int table_row = at.table_row + (row - at.first_row);

@@ -15,7 +15,7 @@ from warpmag.kernels.shared.pieces import cut
 from warpmag.kernels.shared.reductions import group_threads, most_blocks
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
-SPREAD, SHARE, TURN, ADD = range(4)  # the passes, in order; as in ``couplings.h``
+DIFFERENCES, UNIFORM_FIELD, TRANSPOSE, ADD = range(4)  # the passes, in order; as in ``couplings.h``
 _CELLS_PER_THREAD = 500  # cells per thread of a CPU, at least
 
 
@@ -86,14 +86,15 @@ class CellCouplings:
             coupling object share its table.
         moments: Moments [A·m²], Warp array, shape [n].
         h: Field to add to [A/m], Warp array, shape [n].
-        paired: True if the caller calls :meth:`spread` before :meth:`launch`, and adds to ``difference_field`` between.
+        paired: True if the caller calls :meth:`write_differences` before :meth:`launch`, and adds to
+            ``difference_field`` between.
 
     Attributes:
         rotations: Rotation from each body's frame to the world, shape [bodies]; written by the caller.
         means, differences: Moments of cells and half the differences of their halves, in the frames of their grids
-            [A·m²], shape [n]; written by :meth:`spread`.
+            [A·m²], shape [n]; written by :meth:`write_differences`.
         difference_field: Field of the differences by other bodies, in the frames of the grids [A/m], shape [n].
-            :meth:`spread` clears it, and the caller adds to it.
+            :meth:`write_differences` clears it, and the caller adds to it.
         entries: Pairs of cells per evaluation.
         chunks: First moment, count, first row of the body and first row of its table of each chunk of cells.
     """
@@ -109,13 +110,14 @@ class CellCouplings:
         self.means, self.differences = c.means, c.differences
         self.difference_field = c.difference_field
         self.rotations, self.entries = c.rotation, sum(len(coupling.other) for _, coupling in bodies)
-        needed = {SPREAD: not paired, SHARE: bool(c.matrix.numpy().any()), TURN: bool(c.has_slopes), ADD: True}
+        has_matrix, has_slopes = bool(c.matrix.numpy().any()), bool(c.has_slopes)
+        needed = {DIFFERENCES: not paired, UNIFORM_FIELD: has_matrix, TRANSPOSE: has_slopes, ADD: True}
         self._passes = [number for number, is_needed in needed.items() if is_needed]
         self._record_all()
 
     def _record_all(self):
         c = self._couplings
-        self._spread = self._record(c, SPREAD, SPREAD)
+        self._write_differences = self._record(c, DIFFERENCES, DIFFERENCES)
         ranges = [(k, k) for k in self._passes] if c.h.device.is_cuda else [(self._passes[0], ADD)]
         self._launches = [self._record(c, *ends) for ends in ranges]
 
@@ -171,9 +173,9 @@ class CellCouplings:
         c.body_moments = wp.zeros((3, CHUNK * len(chunks)), dtype=dtype, device=device)
         c.fields = wp.zeros((3, CHUNK * len(chunks)), dtype=dtype, device=device)
 
-    def spread(self):
+    def write_differences(self):
         """Launch the half differences of the cells."""
-        self._spread.launch()
+        self._write_differences.launch()
 
     def launch(self):
         """Add the corrections to the field."""

@@ -92,16 +92,20 @@ def distant_body(body, coupling: Coupling) -> DistantBody | None:
         left, inverse = left[:, :rank], (right[:rank].T / values[:rank]) @ left[:, :rank].T
         response = inverse.T @ (cells / norms).T @ patterns @ inverse
         other = _OTHER_RESPONSE * (np.eye(len(left)) - left @ left.T)
-        hardness = np.linalg.inv(0.5 * (response + response.T) + other)
+        inverse_response = np.linalg.inv(0.5 * (response + response.T) + other)
     except np.linalg.LinAlgError:
         return None
-    if not (np.isfinite(hardness).all() and np.isfinite(patterns).all() and np.linalg.eigvalsh(hardness)[0] > 0.0):
+    if not (
+        np.isfinite(inverse_response).all()
+        and np.isfinite(patterns).all()
+        and np.linalg.eigvalsh(inverse_response)[0] > 0.0
+    ):
         return None  # cells of wires of lengths beyond 1e9 radii
     root, cell_root = np.repeat(np.sqrt(shares), 3), np.repeat(np.sqrt(volumes), 3)
     patterns = (patterns / cell_root[:, None]).reshape(len(volumes), 3, -1)
     return DistantBody(
-        _coupling(points, shares, hardness / (root[:, None] * root)), shares, *_box(body),
-        coefficients=inverse @ hardness / root, patterns=patterns.transpose(1, 2, 0).copy(),
+        _coupling(points, shares, inverse_response / (root[:, None] * root)), shares, *_box(body),
+        coefficients=inverse @ inverse_response / root, patterns=patterns.transpose(1, 2, 0).copy(),
     )  # fmt: skip
 
 
@@ -166,10 +170,10 @@ def _box(body) -> tuple[np.ndarray, np.ndarray]:
     return (body.positions - radii).min(axis=0), (body.positions + radii).max(axis=0)
 
 
-def _coupling(points: np.ndarray, volumes: np.ndarray, hardness: np.ndarray) -> DistantCoupling:
-    """Return the coupling of moments at points with the inverse response ``hardness`` [1/m³], shape [3 k, 3 k]."""
+def _coupling(points: np.ndarray, volumes: np.ndarray, inverse_response: np.ndarray) -> DistantCoupling:
+    """Return the coupling of moments at points from their inverse response [1/m³], shape [3 k, 3 k]."""
     k, radii = len(points), np.cbrt(0.75 * volumes / np.pi)
-    full = np.diag(np.repeat(1.0 / (3.0 * volumes), 3)) - hardness
+    full = np.diag(np.repeat(1.0 / (3.0 * volumes), 3)) - inverse_response
     law = full_tensors(pair_law_tensors(points, radii).reshape(-1, 6)).reshape(k, k, 3, 3)
     differences = full.reshape(k, 3, k, 3).transpose(0, 2, 1, 3) - law
     sides = np.repeat(np.cbrt(volumes)[:, None], 3, axis=1)
