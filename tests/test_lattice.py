@@ -269,6 +269,19 @@ def test_spacing_larger_than_the_shape_gives_one_moment_at_the_centroid(name):
     np.testing.assert_allclose(body.positions[0], [0.0, 0.0, height], atol=1e-15)
 
 
+def test_spacing_above_the_automatic_cells_gives_fewer_moments():
+    """A ring of overlapping boxes, whose common volumes counted repeatedly are more than 729 cells at any spacing."""
+    angles = 2.0 * np.pi * np.arange(12) / 12
+    radial, size = np.stack([np.cos(angles), 0.0 * angles, np.sin(angles)], axis=1), [0.0015, 0.0025, 0.0035]
+    turns = [(0.0, -np.sin(a / 2), 0.0, np.cos(a / 2)) for a in angles]
+    ring = [lattice.box(size).posed(0.008 * at, turn) for at, turn in zip(radial, turns, strict=True)]
+    automatic, given = (lattice.fill(ring, spacing, 3, together=True) for spacing in (0.0, 0.003))
+    assert automatic.pieces[0].sides.max() < 0.003
+    assert len(given.volumes) < 0.5 * len(automatic.volumes)
+    # cells differ from cubes of the spacing by up to a factor, and parts of several shapes share cells
+    assert len(given.volumes) < 2.0 * given.volumes.sum() / 0.003**3
+
+
 def test_ball_is_one_moment():
     body = lattice.ball(0.005)
     assert body.radii[0] == pytest.approx(0.005, rel=1e-14)

@@ -260,7 +260,9 @@ def fill(
     most = max(AUTOMATIC_COUNT, across**3 * len(parts))
     automatic, across = _automatic_cells(parts, across, most, together)
     if spacing > 0.0:
-        lattice = _fill(parts, spacing, across if spacing < automatic else 1, together)
+        # shapes with much common volume have an automatic spacing above the sides of their cells
+        longest = max(cells.sides.max() for cells in _grids(parts, automatic, across, together))
+        lattice = _fill(parts, spacing, across if spacing < min(automatic, longest) else 1, together)
         if len(lattice.volumes) > largest:
             raise too_many
         return lattice
