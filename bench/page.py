@@ -1,8 +1,8 @@
-"""Writes the tables of ``docs/benchmarks.md`` and of README: ``python -m bench.page``.
+"""Writes the tables of ``docs/benchmarks.md``, and the figures that other pages quote: ``python -m bench.page``.
 
 The figures are those of ``docs/benchmarks/*.jsonl``, lines of ``python -m bench.all``, a file for each machine. Tables
-stand between comments such as ``<!-- benchmark: steps -->`` and ``<!-- benchmark end -->``. The main figures of each
-machine and commit are also kept in ``docs/benchmarks/history.jsonl``.
+and quoted figures stand between comments such as ``<!-- benchmark: steps -->`` and ``<!-- benchmark end -->``. The main
+figures of each machine and commit are also kept in ``docs/benchmarks/history.jsonl``.
 """
 
 import json
@@ -13,10 +13,10 @@ from bench.paper.table1 import PAPERS_TIMES
 from bench.report import duration, machine_of, read
 
 ROOT = Path(__file__).parents[1]
-PAGES = (ROOT / "README.md", ROOT / "docs" / "benchmarks.md")
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 DATA = ROOT / "docs" / "benchmarks"
 HISTORY = DATA / "history.jsonl"
-_TABLE = re.compile(r"(<!-- benchmark: (\w+) -->\n).*?(<!-- benchmark end -->)", re.DOTALL)
+QUOTED = re.compile(r"(<!-- benchmark: (\w+) -->).*?(<!-- benchmark end -->)", re.DOTALL)
 _SCENES = {
     "balls_up": "Balls Up, 243 balls",
     "alphabets": "Alphabets, 100 letters",
@@ -24,6 +24,8 @@ _SCENES = {
     "sakura_tree": "Sakura Tree, 2,500 balls",
 }
 _OWN = ("warpmag", "h_field")  # names of warpmag among the peers
+_GPU = "NVIDIA H200"
+"""Machine of the quoted figures."""
 
 Machines = dict[str, list[dict]]
 """Lines of each machine, by its name."""
@@ -48,7 +50,7 @@ def _time(lines: list[dict]) -> str:
 
 def _table(head: list[str], rows: list[list[str]]) -> str:
     lines = [head, ["---"] * len(head), *rows]
-    return "\n" + "".join(f"| {' | '.join(row)} |\n" for row in lines) + "\n"
+    return "\n\n" + "".join(f"| {' | '.join(row)} |\n" for row in lines) + "\n"
 
 
 def sources(data: Machines) -> str:
@@ -62,17 +64,18 @@ def sources(data: Machines) -> str:
 
 def steps(data: Machines) -> str:
     """Return the table of the steps of scenes, beside the paper's times and its method on the same machine."""
-    rows = []
-    data = {name: lines for name, lines in data.items() if _cases(lines, "steps")}
-    for scene, title in _SCENES.items():
-        row = [title]
-        for lines in data.values():
-            rerun = _cases(lines, "paper", scene=scene)
-            rerun_time = sum(rerun[0][f"t{part}_ms"] for part in "ifr") if rerun else 0.0
-            row += [_time(_cases(lines, "steps", scene=scene)), duration(1e-3 * rerun_time) if rerun else ""]
-        rows.append([*row, f"{sum(PAPERS_TIMES[scene, 'paper']):.3g} ms"])
-    head = [text for name in data for text in (name, "the paper's method on it")]
-    return _table(["scene", *head, "paper, Core i7-8700"], rows)
+    columns = {}
+    for name, lines in data.items():
+        times = {line["scene"]: line["seconds"] for line in _cases(lines, "steps")}
+        reruns = {line["scene"]: sum(1e-3 * line[f"t{part}_ms"] for part in "ifr") for line in _cases(lines, "paper")}
+        columns |= {name: times, f"the paper's method, {name}": reruns}
+    columns["paper, Core i7-8700"] = {scene: 1e-3 * sum(PAPERS_TIMES[scene, "paper"]) for scene in _SCENES}
+    columns = {head: times for head, times in columns.items() if times}
+    rows = [
+        [title, *(duration(times[scene]) if scene in times else "" for times in columns.values())]
+        for scene, title in _SCENES.items()
+    ]
+    return _table(["scene", *columns], rows)
 
 
 def fields(data: Machines) -> str:
@@ -81,8 +84,8 @@ def fields(data: Machines) -> str:
     for name, lines in data.items():
         compared = sorted(_cases(lines, "compare"), key=lambda line: (line["count"], line["seconds"]))
         rows = [[f"{line['count']:,}", f"`{line['peer']}`", _time([line]), f"{line['error']:.0e}"] for line in compared]
-        text += f"\n**{name}**\n" + _table(["balls", "program", "time", "error"], rows)
-    return text
+        text += f"\n\n**{name}**" + _table(["balls", "program", "time", "error"], rows)
+    return text.replace("\n\n\n", "\n\n")
 
 
 def multipoles(data: Machines) -> str:
@@ -95,14 +98,14 @@ def multipoles(data: Machines) -> str:
             method = names[line["method"]] + (f", {line['rtol']:g}" if line["rtol"] else "")
             quantity = {"field": "field", "wrench": "force, torque"}[line["quantity"]]
             rows.append([f"{line['count']:,}", quantity, method, _time([line]), f"{line['error']:.0e}"])
-        text += f"\n**{name}**\n" + _table(["moments", "quantity", "method", "time", "error"], rows)
-    return text
+        text += f"\n\n**{name}**" + _table(["moments", "quantity", "method", "time", "error"], rows)
+    return text.replace("\n\n\n", "\n\n")
 
 
 def worlds(data: Machines) -> str:
     """Return the table of many worlds."""
     rows = [
-        [name, f"{line['worlds']:,}", f"{line['count']}", f"{line['world_steps_per_second']:.2g}"]
+        [name, f"{line['worlds']:,}", f"{line['count']}", _rate(line)]
         for name, lines in data.items()
         for line in _cases(lines, "worlds")
     ]
@@ -110,16 +113,17 @@ def worlds(data: Machines) -> str:
 
 
 def summary(data: Machines) -> str:
-    """Return the five rows of README."""
+    """Return the five rows of README, of machines with steps."""
+    data = {name: lines for name, lines in data.items() if _cases(lines, "steps")}
     rows = [
         ["step of 1 ms of Balls Up, 243 balls", *(_time(_cases(x, "steps", scene="balls_up")) for x in data.values())],
         ["step of Sakura Tree, 2,500 balls", *(_time(_cases(x, "steps", scene="sakura_tree")) for x in data.values())],
-        ["field of balls on each other", *map(_against_peers, data.values())],
+        ["field of balls on each other, all pairs", *map(_against_peers, data.values())],
         ["field of many moments, error at most 1e-3", *map(_many, data.values())],
-        ["64 balls in many worlds", *map(_rate, data.values())],
+        ["magnetics of many worlds of 64 balls", *map(_many_worlds, data.values())],
     ]
     commits = ", ".join(sorted({lines[0]["commit"] for lines in data.values()}))
-    return _table(["", *data], rows) + f"*`python -m bench.all`, commit {commits}.*\n"
+    return _table(["computation", *data], rows) + f"*`python -m bench.all`, commit {commits}.*\n\n"
 
 
 def _against_peers(lines: list[dict]) -> str:
@@ -127,26 +131,47 @@ def _against_peers(lines: list[dict]) -> str:
     compared = _cases(lines, "compare", count=largest)
     peer = min((line for line in compared if line["peer"] not in _OWN), key=lambda line: line["seconds"])
     own = _cases(compared, "compare", peer="warpmag")
-    return f"{largest:,}: {_time(own)}; {peer['peer']} {_time([peer])}"
+    return f"{largest:,} balls: {_time(own)}; the best other program, `{peer['peer']}`: {_time([peer])}"
 
 
 def _many(lines: list[dict]) -> str:
     own = _cases(lines, "many", method="fmm", quantity="field", rtol=1e-3)
     peer = _cases(lines, "many", method="fmm3d")
-    return f"{own[0]['count']:,}: {_time(own)}" + (f"; FMM3D {_time(peer)}" if peer else "")
+    return f"{own[0]['count']:,} moments: {_time(own)}" + (f"; FMM3D: {_time(peer)}" if peer else "")
 
 
-def _rate(lines: list[dict]) -> str:
+def _many_worlds(lines: list[dict]) -> str:
     (line,) = _cases(lines, "worlds")
-    return f"{line['worlds']:,} worlds, {line['world_steps_per_second']:.2g} steps of worlds per second"
+    return f"{line['worlds']:,} worlds: {_rate(line)} steps of worlds per second"
 
 
-TABLES = {table.__name__: table for table in (sources, steps, fields, multipoles, worlds, summary)}
+def _rate(line: dict) -> str:
+    """Steps of worlds per second, two digits."""
+    rate = float(f"{line['world_steps_per_second']:.2g}")
+    return f"{1e-6 * rate:g} million" if rate >= 1e6 else f"{rate:,.0f}"
+
+
+def rate_of_worlds(data: Machines) -> str:
+    """Return the steps of worlds per second on the GPU."""
+    (line,) = _cases(data[_GPU], "worlds")
+    return _rate(line)
+
+
+def largest_field(data: Machines) -> str:
+    """Return the largest field of all pairs on the GPU: the number of moments and the time."""
+    line = max(_cases(data[_GPU], "compare", peer="warpmag"), key=lambda line: line["count"])
+    return f"{line['count']:,} moments in {_time([line])}"
+
+
+TABLES = {
+    table.__name__: table
+    for table in (sources, steps, fields, multipoles, worlds, summary, rate_of_worlds, largest_field)
+}
 
 
 def filled(text: str, data: Machines) -> str:
-    """Return the text of a page with its tables."""
-    return _TABLE.sub(lambda match: match[1] + TABLES[match[2]](data) + match[3], text)
+    """Return the text of a page with its tables and quoted figures."""
+    return QUOTED.sub(lambda match: match[1] + TABLES[match[2]](data) + match[3], text)
 
 
 def figures(lines: list[dict]) -> dict:

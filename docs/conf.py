@@ -5,6 +5,7 @@ import re
 from functools import partial
 from pathlib import Path
 
+from docutils import nodes
 from pxr import Sdf
 
 import warpmag.usd  # noqa: F401 - registers schemas before USD is used
@@ -26,6 +27,7 @@ extensions = [
 exclude_patterns = ["paper/*"]
 html_theme = "furo"
 html_title = f"warpmag {release}"
+html_static_path, html_css_files = ["static"], ["page.css"]
 
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
@@ -99,6 +101,23 @@ def _fill_in(app, page, source):
     source[0] = re.sub(rf"^<!-- ({names}) -->$", lambda marker: GENERATED[marker[1]](), source[0], flags=re.MULTILINE)
 
 
+FIGURE = re.compile(r"(\d+e-\d+|\d+ (?:%|[mµ]?[msTNJA]|[kM]?Hz|A/m|G?B)(?!\w))")
+"""A number with an exponent or a unit."""
+
+
+def _keep_figures_in_a_line(app, page, *_):
+    """Mark figures of a page, so that ``static/page.css`` forbids a line break before a unit or in an exponent."""
+    for text in list(page.findall(nodes.Text)):
+        if isinstance(text.parent, (nodes.literal, nodes.literal_block, nodes.math)) or not FIGURE.search(text):
+            continue
+        parts = enumerate(FIGURE.split(text))
+        marked = [
+            nodes.inline("", part, classes=["figure"]) if k % 2 else nodes.Text(part) for k, part in parts if part
+        ]
+        text.parent.replace(text, marked)
+
+
 def setup(app):
-    """Register the replacement of comments. Sphinx calls this function."""
+    """Register the replacement of comments and the marks of figures. Sphinx calls this function."""
     app.connect("source-read", _fill_in)
+    app.connect("doctree-resolved", _keep_figures_in_a_line)

@@ -22,7 +22,7 @@ from warpmag.show.ray_tracing import ModelRenderer
 
 DOCS = Path(__file__).parent
 FOLDER = DOCS / "pictures" / "gallery"
-SIZE = (360, 202)  # px
+SIZE = (720, 404)  # px; a phone shows 360 points of two pixels
 SCENES = {"alphabets": 120, "balls_up": 60, "crystal_balls": 0, "falling_magnet": 90, "sakura_tree": 100}
 """Scenes, and the number of frames to run; 0 for a scene at rest, which has a still."""
 OPTIONS = {"worlds": "--world-count 5", "compass_swarm": "--columns 1 --rows 8", "sorter": "--coils 3"}
@@ -37,6 +37,9 @@ VIEWS = {
 """Directions from the bodies to the camera, where they are not those of the command."""
 PITCHES = {"worlds": (0.034, 0.0, 0.0), "compass_swarm": (0.0, 0.03, 0.0)}
 """Distance of neighboring worlds in pictures [m]."""
+SLOW = {"levitation": 5, "worlds": 3}
+"""Numbers of frames of examples that move for milliseconds only: a picture of each step, in slow motion."""
+_RATE = 25.0  # pictures per second of slow motion
 _MOST = 40
 """Largest number of pictures of an example."""
 IRON, MAGNET, GROUND = (0.62, 0.63, 0.65), (0.75, 0.06, 0.05), (0.62, 0.63, 0.62)  # sRGB
@@ -110,14 +113,33 @@ def film_example(name: str) -> None:
     options = Example.create_parser().parse_args(OPTIONS.get(name, "").split())
     camera = Camera(num_frames=options.num_frames)
     camera.pitch, camera.view = PITCHES.get(name, camera.pitch), VIEWS.get(name)
-    example = Example(camera, options)
-    stride, times = -(-options.num_frames // _MOST), []
-    for frame in range(options.num_frames):
+    rate = (_draw_steps if name in SLOW else _draw_frames)(Example(camera, options), SLOW.get(name, options.num_frames))
+    films.write(FOLDER / f"{name}.webp", camera.pictures, [], rate)
+
+
+def _draw_frames(example, count: int) -> float:
+    """Run frames of an example and draw some; return the pictures per second of the motion."""
+    stride, times = -(-count // _MOST), []
+    for frame in range(count):
         example.step()
         if frame % stride == 0:
             example.render()
             times.append(example.sim_time)
-    films.write(FOLDER / f"{name}.webp", camera.pictures, [], (len(times) - 1) / (times[-1] - times[0]))
+    return (len(times) - 1) / (times[-1] - times[0])
+
+
+def _draw_steps(example, count: int) -> float:
+    """Run frames of an example and draw each step of its simulation; return the pictures per second of the film."""
+    step = example.simulation.step
+
+    def step_and_draw() -> None:
+        step()
+        example.render()
+
+    example.simulation.step = step_and_draw
+    for _ in range(count):
+        example.step()
+    return _RATE
 
 
 def picture(name: str) -> str:
@@ -134,7 +156,10 @@ def page() -> str:
         "Stills of scenes are [drawn by Blender](pictures.md).\n\n"
     )
     entries = [(f"warpmag run {name}", scene_line(name), name) for name in SCENES]
-    examples_of = [(f"python -m warpmag.examples {name}", line, name) for name, line in examples.get_examples().items()]
+    examples_of = [
+        (f"python -m warpmag.examples {name}", line.rstrip(".") + " (slow motion)" * (name in SLOW), name)
+        for name, line in examples.get_examples().items()
+    ]
     sections = (("Scenes", entries), ("Examples", examples_of))
     return head + "\n".join(
         f"## {title}\n\n"

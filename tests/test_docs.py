@@ -38,10 +38,9 @@ SLOW = (
 WITH_EXAMPLE = {
     *("h_field", "wrench", "solve_induction", "sweep", "material", "MagnetizationCurve", "register_custom_attributes"),
     *("add_inducible", "add_permanent", "add_balls", "add_coil", "add_field_map", "Magnetics", "Simulation", "check"),
-    "SensorMagnetometer",
+    *("SensorMagnetometer", "render", "export", "Display", "KeyedCurrents"),
 }
-"""Public names whose docstring has an example that runs. Other names need a viewer, a finished run or a time-sampled
-stage: their pages have programs."""
+"""Public names whose docstring has an example that runs. Others are results, errors and an old name."""
 
 
 def program(page: Path) -> str:

@@ -52,6 +52,13 @@ def export(
 
     Raises:
         InputError: The stage cannot be read, the output cannot be written, or an argument is wrong.
+
+    Example:
+        >>> import warpmag
+        >>> simulation = warpmag.Simulation("lift.usda", device="cpu")
+        >>> statistics = simulation.run(2, output="run.usda")
+        >>> warpmag.export("run.usda", "run_for_blender.usdc", fps=24)
+        []
     """
     suffix = usable_path(output).suffix
     check_positive("fps", fps)

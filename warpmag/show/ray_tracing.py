@@ -96,6 +96,11 @@ def render(
     Raises:
         InputError: The stage cannot be read, has no such frames, camera or moments, the pictures cannot be written, or
             an argument has another type.
+
+    Example:
+        >>> import warpmag
+        >>> warpmag.render("lift.usda", "lift.png", size=(64, 36), device="cpu")
+        [PosixPath('lift.png')]
     """
     output, size = usable_path(output), whole_pair("size", size)
     films.check_name(output)

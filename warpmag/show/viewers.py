@@ -36,15 +36,20 @@ class Display:
 
     Every magnetic shape has an arrow along its magnetization. Length and color of the arrow, from violet over green to
     yellow, follow the magnetization over the largest one in the frame. The camera of ``gl``, ``viser`` and ``rtx``
-    starts where it sees all bodies. ::
-
-        display = warpmag.Display(newton.viewer.ViewerGL(), model, magnetics)
-        display.apply_forces(state)  # in each substep: the mouse drags bodies
-        display.show(time, state)
+    starts where it sees all bodies.
 
     Attributes:
         viewer: The viewer.
         restarted: True after the reset button was pressed, if :meth:`allow_restart` was called.
+
+    Example:
+        >>> import newton
+        >>> import warpmag
+        >>> simulation = warpmag.Simulation("lift.usda", device="cpu")
+        >>> viewer = newton.viewer.ViewerNull()  # or ViewerGL(), ViewerViser()
+        >>> display = warpmag.Display(viewer, simulation.model, simulation.magnetics)
+        >>> simulation.step()
+        >>> display.show(simulation.time, simulation.state)
     """
 
     def __init__(self, viewer, model: newton.Model, magnetics: Magnetics):

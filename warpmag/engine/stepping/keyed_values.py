@@ -78,15 +78,30 @@ class KeyedCurrents:
     Coils with a resistance have time-sampled voltages in place of currents.
 
     ``Simulation`` sets all keyed values of a stage itself. ``KeyedCurrents`` sets coils only: ``add_usd`` imports
-    motions and magnetizations at the start of the stage, without keys. Replicated worlds share keys::
-
-        currents = warpmag.KeyedCurrents(model)
-        currents.set(0.25)  # 0.25 s after the start of the stage
-        magnetics.apply(state)
+    motions and magnetizations at the start of the stage, without keys. Replicated worlds share keys.
 
     Attributes:
         shapes: Shape indices of the coils with keys.
         time: Time since the start of the stage [s], on the device, float64, shape [1].
+
+    Example:
+        >>> import newton
+        >>> import warpmag
+        >>> from pxr import Usd
+        >>> stage = Usd.Stage.CreateInMemory()  # 24 time codes a second
+        >>> coil = stage.DefinePrim("/Coil", "Xform")
+        >>> marked = coil.AddAppliedSchema("WarpmagCoilAPI")
+        >>> marked = coil.GetAttribute("warpmag:coil:radius").Set(0.01)
+        >>> current = coil.GetAttribute("warpmag:coil:ampereTurns")
+        >>> marked = current.Set(0.0, 0.0) and current.Set(100.0, 24.0)  # A·turns at a time code
+        >>> builder = newton.ModelBuilder()
+        >>> warpmag.register_custom_attributes(builder)
+        >>> imported = builder.add_usd(stage)
+        >>> model = builder.finalize(device="cpu")
+        >>> currents = warpmag.KeyedCurrents(model)
+        >>> currents.set(0.25)  # s after the start of the stage
+        >>> float(model.warpmag.strength.numpy()[currents.shapes[0]])
+        25.0
     """
 
     def __init__(self, model: newton.Model):
