@@ -29,7 +29,7 @@ FILE = re.compile(r"^```(?:xml)?\n((?:#usda 1\.0\n# |<!-- )(\S+).*?)^```$", re.M
 """A whole stage or MJCF and the file to save it as."""
 COMMAND = re.compile(r"^(?:pip install uv && uv run )?(warpmag .*)$", re.MULTILINE)
 SLOW = (
-    "physics.md",
+    *("physics.md", "physics/equilibrium.md", "physics/bodies.md", "physics/coils.md"),
     *(f"howto/{name}.md" for name in ("coils", "design", "energy", "gradients", "holding", "mujoco", "newton")),
     *(f"tutorials/{name}.md" for name in ("blender", "coils", "robot")),
 )
