@@ -150,9 +150,9 @@ def test_bodies_that_move_together_keep_their_tensors(device):
     poses = [(Rotation.identity(), np.zeros(3)), (POSES["touching"][0], np.array(POSES["touching"][1]))]
     system, _ = make_pair(bodies, poses, dtype="float32", device=device, susceptibility=math.inf)
     system.solve()
-    before = system._cell_pairs._pairs.matrix.numpy().copy()
+    before = system._cell_pairs.arrays.matrix.numpy().copy()
     spin = Rotation.from_rotvec([0.0, 0.0, 1e-3])
     put(system, bodies, [(spin * turn, spin.apply(place)) for turn, place in poses])
     system.solve()
-    changed = np.abs(system._cell_pairs._pairs.matrix.numpy() - before).max()
+    changed = np.abs(system._cell_pairs.arrays.matrix.numpy() - before).max()
     assert changed <= 1e-4 * np.abs(before).max()  # poses that rounding moves by more than the tolerance

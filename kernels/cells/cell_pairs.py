@@ -10,6 +10,7 @@ that intersect the points can make it negative. So a cell inside another body ge
 """
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -18,6 +19,7 @@ import warp as wp
 from warpmag.kernels.pairs import neighbors
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
+from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
 WINDOW = 2.5, 3.5
@@ -56,10 +58,8 @@ _MATRIX_ROWS, _DETAIL_ROWS, _POSE_ROWS = 9, 27, 7
 """Numbers of the matrices of a pair and of a relative pose; as in ``cell_pairs.h``."""
 _BINS = 256
 """Bins of rows by their numbers of candidates; as in ``cell_pairs.h``."""
-_CELLS_PER_THREAD = 100
+CELLS_PER_THREAD = 100
 """Fewest cells per thread of a CPU."""
-_GROUP = 32
-"""Threads of a GPU that share the candidates of a cell: a large cell among small ones has thousands."""
 
 
 @cache
@@ -110,10 +110,9 @@ def cell_pairs_type(dtype):
     return CellPairs
 
 
-@cache
-def _kernel(dtype, group: int):
-    arguments = {**PASS_ARGUMENTS, "arrays": cell_pairs_type(dtype)}
-    constants = dict(
+def pair_constants() -> dict[str, float]:
+    """Return the constants of ``cell_pairs.h`` by name."""
+    return dict(
         OVERLAP_DEMAGNETIZATION=OVERLAP_DEMAGNETIZATION,
         FULL_OVERLAP_DEPTH=FULL_OVERLAP_DEPTH,
         CLOSE_BEGIN=CLOSE[0],
@@ -123,14 +122,13 @@ def _kernel(dtype, group: int):
         MARGIN=_MARGIN,
         MU0=MU0,
     )
-    return native_kernel(
-        "add_cell_pairs(thread, first, last, threads, team.data, arrays)",
-        "cells/cell_pairs.h",
-        arguments,
-        dtype=dtype,
-        GROUP=group,
-        **constants,
-    )
+
+
+@cache
+def _kernel(dtype, group: int):
+    arguments = {**PASS_ARGUMENTS, "arrays": cell_pairs_type(dtype)}
+    call = "add_cell_pairs(thread, first, last, threads, team.data, arrays)"
+    return native_kernel(call, "cells/cell_pairs.h", arguments, dtype=dtype, GROUP=group, **pair_constants())
 
 
 def _volume_factors(half_sides) -> np.ndarray:
@@ -203,12 +201,13 @@ class CellPairs:
         forces, torques: Forces [N] and torques [N·m] to add to, Warp arrays, shape [n].
 
     Attributes:
+        arrays: The struct of arrays (:func:`cell_pairs_type`).
         crowded: 1 if a cell had more candidates than a list holds and took no part, Warp array, shape [1].
     """
 
     def __init__(self, bodies, takes_part, cells, layout, rotatable, packed, h, forces, torques):
         """Lay out the arrays on the device of the moments."""
-        self._cells, worlds = cells, layout.worlds
+        self._cells, self._model, worlds = cells, (bodies, takes_part, layout, rotatable), layout.worlds
         dtype, device, n = packed.dtype, packed.device, packed.count
         group, body, half = np.full(n, -1), np.zeros(n, int), np.ones((4, n))
         for number, (first, coupling) in enumerate(bodies):
@@ -235,7 +234,7 @@ class CellPairs:
             n, packed.packed, put(group), reach=reach, ratio=ratio, capacity=capacity,
             radii=put(0.5 * half[3], dtype), bodies=body,
         )  # fmt: skip
-        self._pairs = a = cell_pairs_type(dtype)()
+        self.arrays = a = cell_pairs_type(dtype)()
         quaternion = wp.types.quaternion(dtype)
         a.group, a.body, a.half, a.movable = put(group), put(body), put(half, dtype), put(layout.movable)
         a.rotatable, a.inducible = rotatable, put(~layout.permanent)
@@ -262,12 +261,22 @@ class CellPairs:
             self._record(ADD_FORCE, ADD_FORCE),
         )
 
+    def for_all_moments(self, cells, packed, h) -> "CellPairs":
+        """Return pairs of the same model with lists and tensors of their own, for other moments.
+
+        They add the field of the ``packed`` moments to ``h`` at all moments, also at permanent ones. They have no
+        forces. ``cells`` are the ``CellCouplings`` of these moments.
+        """
+        bodies, takes_part, layout, rotatable = self._model
+        layout, none = replace(layout, permanent=np.zeros_like(layout.permanent)), wp.zeros_like(h)
+        return CellPairs(bodies, takes_part, cells, layout, rotatable, packed, h, none, none)
+
     def _record(self, first: int, last: int) -> list:
         """Return launches of passes ``first`` to ``last``: one on a CPU, one each on a GPU."""
-        pairs, device = self._pairs, self._pairs.h.device
-        group, rows = _GROUP if device.is_cuda else 1, max(pairs.cell.shape[0], pairs.group.shape[0], _BINS)
+        pairs, device = self.arrays, self.arrays.h.device
+        group, rows = group_threads(device, long_lists=True), max(pairs.cell.shape[0], pairs.group.shape[0], _BINS)
         kernel = _kernel(pairs.packed.dtype, group)
-        sizes = dict(threads=threads_for(rows, _CELLS_PER_THREAD), gpu_threads=group * rows)
+        sizes = dict(threads=threads_for(rows, CELLS_PER_THREAD), gpu_threads=group * rows)
         ranges = [(k, k + 1) for k in range(first, last + 1)] if device.is_cuda else [(first, last + 1)]
         return [launch_passes(kernel, *ends, pairs, device=device, record_cmd=True, **sizes) for ends in ranges]
 
@@ -298,4 +307,4 @@ class CellPairs:
     def persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays that the next search and the next evaluation read, by name."""
         kept = ("rows", "cell", "pose", "matrix", "detail", "overlap_factor", "crowded", "close_count")
-        return neighbors.persistent_lists(self._lists) | {name: getattr(self._pairs, name) for name in kept}
+        return neighbors.persistent_lists(self._lists) | {name: getattr(self.arrays, name) for name in kept}

@@ -30,9 +30,9 @@ from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes
 
-_WARP, _LEAST_SHARED, _MOST_SHARED = 32, 256, 8192
-"""Threads of a GPU that share a moment with at least this many sources, in systems of at most this many moments: so few
-moments occupy all processors, while more moments load the sources less often with smaller groups."""
+_LEAST_SHARED, _MOST_SHARED = 256, 8192
+"""Fewest sources per moment for which a warp shares a moment, in systems of at most so many moments: so few moments
+occupy all processors, while more moments load the sources less often with smaller groups."""
 
 _FEWEST_EVALUATED, _MOST_IN_ONE_SUM = 512, 4096
 """Fewest sources per moment for which a GPU computes gradients of fields faster as a field and two forces, in systems
@@ -131,7 +131,7 @@ class PairGradients:
         self.by_external_field = out[-1]
         segments = np.stack([ends[:-1], ends[1:]] * 2, axis=1)
         is_shared = device.is_cuda and n <= _MOST_SHARED and pair_count(segments) >= _LEAST_SHARED * n
-        self._group = _WARP if is_shared else group_threads(device)
+        self._group = group_threads(device, long_lists=is_shared)
         _, a.begin, a.end = target_rows(segments, device)
         if device.is_cpu:
             tiles, shares, parts, self._threads = cpu_tiles(segments, True, dtype)

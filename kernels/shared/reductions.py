@@ -6,13 +6,14 @@ from typing import Any
 import warp as wp
 
 _GROUP_THREADS = 8  # threads of a GPU that share the neighbors of a moment; a power of two, at most a warp
+_WARP = 32  # threads of a warp, which share the thousands of neighbors of a large cell among small ones
 
 _BLOCKS = 16  # per multiprocessor of a GPU, in launches over lists
 
 
-def group_threads(device) -> int:
-    """Number of threads that share the neighbors of a moment: ``_GROUP_THREADS`` on a GPU, 1 on a CPU."""
-    return _GROUP_THREADS if device.is_cuda else 1
+def group_threads(device, *, long_lists: bool = False) -> int:
+    """Number of threads that share the neighbors of a moment: 1 on a CPU, on a GPU 8, or a warp for long lists."""
+    return (_WARP if long_lists else _GROUP_THREADS) if device.is_cuda else 1
 
 
 def most_blocks(device) -> int:

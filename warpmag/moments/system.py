@@ -214,13 +214,13 @@ class MomentSystem:
 
         ``closed_forms`` are the first moments of bodies whose near field has a closed form, in place of corrections.
         """
-        self._cells = self._cell_pairs = self.rotations = self.crowded = None
-        self._couplings = couplings
+        self._couplings, self._cells, self._cell_pairs, self.rotations, self.crowded = (), None, None, None, None
         if couplings:
             self._induction.within_bodies = int(all(coupling.near for _, coupling in couplings))
             takes_part = [coupling.near and first not in closed_forms for first, coupling in couplings]
             in_world = np.bincount(layout.worlds[[first for first, _ in couplings]], minlength=layout.worlds.max() + 1)
             couplings = [(first, coupling.among(in_world[layout.worlds[first]])) for first, coupling in couplings]
+            self._couplings = couplings
             parts = np.bincount(layout.worlds[[first for first, _ in couplings]], takes_part, len(in_world))
             paired = bool(parts.max() > 1) or bool(parts[layout.worlds[layout.single_balls]].any())
             self._cells = CellCouplings(couplings, self.moments, self.h, paired=paired)
@@ -316,7 +316,8 @@ class MomentSystem:
     def gradients(self) -> SystemGradients:
         """Gradients of solves and forces. Their buffers are allocated at the first access."""
         arrays = self._packed, self._induction, self.material, self.worlds, self.world_ranges
-        return SystemGradients(*arrays, self.rtol, self.fmm_rtol, self.source_interaction, self._couplings)
+        cells = self._couplings, self._cell_pairs
+        return SystemGradients(*arrays, self.rtol, self.fmm_rtol, self.source_interaction, *cells)
 
     def start_cold(self, chosen: wp.array | None = None):
         """Start the next solve as the first one, from zero magnetization, in chosen worlds.

@@ -31,6 +31,7 @@ from warpmag.errors import ConvergenceWarning, InputError, warn_caller
 from warpmag.kernels.applied.coil_gradients import CoilGradients
 from warpmag.kernels.applied.fields import AppliedForces
 from warpmag.kernels.applied.solid_gradients import SolidGradients
+from warpmag.kernels.cells.cell_pairs import CellPairs
 from warpmag.kernels.induction.cell_turns import CellTurns
 from warpmag.kernels.induction.tangent import Tangent
 from warpmag.kernels.material.curves import CurveParameters
@@ -60,11 +61,11 @@ class SystemGradients:
         rtol: Relative error of the solves, and of the linear solve.
         fmm_rtol: Relative error of fields by the fast multipole method; None means sums over all pairs.
         interaction: Fields and forces of coils, field maps and permanent bodies; None without them.
-        couplings: First moment and coupling of each body of cells, of which a world has one at most.
+        couplings: First moment and coupling of each body of cells.
+        cell_pairs: Near cells of different bodies; None without them.
 
     Attributes:
-        cells: Gradients by rotations of bodies of cells; None without them. The caller writes their state after
-            :meth:`load`.
+        cells: Gradients by poses of bodies of cells; None without them.
         coils: Gradients by coils and field maps; None without them. The caller writes their state after :meth:`load`.
         solids: Gradients by permanent bodies with closed forms; None without them. The caller writes their ``frames``
             after :meth:`load`.
@@ -89,6 +90,7 @@ class SystemGradients:
         fmm_rtol: float | None,
         interaction: AppliedForces | None = None,
         couplings=(),
+        cell_pairs: CellPairs | None = None,
     ):
         """Allocate the buffers."""
         self._moments = PackedMoments(packed.radii, largest_radius=packed.largest_radius, groups=worlds, moving=False)
@@ -108,7 +110,9 @@ class SystemGradients:
             ranks=current_ranks(),
         )  # fmt: skip
         self._tangent = Tangent(state, self._acting, self._field, material, rtol)
-        self.cells = CellTurns(couplings, self._tangent.vectors, self._field) if couplings else None
+        self.cells = None
+        if couplings:
+            self.cells = CellTurns(couplings, cell_pairs, self._acting, self._tangent.vectors, self._field)
         self._wrenches = PairGradients(self._bodies, ends, external_field=self.external_field)
         if not self._fast and one_sum_is_faster(packed.device, pair_count(ranges[:, [0, 2, 0, 2]]), packed.count):
             self.fields = PairGradients(self._moments, ends, cotangents=self._acting.moments)
@@ -122,8 +126,11 @@ class SystemGradients:
         self.by_field = self._tangent.eta
         self.by_positions, self.by_moments = self.fields.by_positions, self.fields.by_moments
 
-    def load(self, positions, moments, h, external_field) -> None:
-        """Set the state at which gradients are computed, arrays as the attributes of these names."""
+    def load(self, positions, moments, h, external_field, rotations=None) -> None:
+        """Set the state at which gradients are computed, arrays as the attributes of these names.
+
+        ``rotations`` are those of bodies of cells, shape [bodies].
+        """
         for values, own in (
             (positions, self.positions),
             (moments, self.moments),
@@ -138,6 +145,9 @@ class SystemGradients:
         for fast in self._fast:
             fast.build()
         self._tangent.linearize(self.h)
+        if self.cells is not None:
+            wp.copy(self.cells.rotations, rotations)
+            self.cells.load(self.positions)
         if self.coils is not None:
             self.coils.by_sources.zero_()
         if self.solids is not None:
@@ -156,6 +166,8 @@ class SystemGradients:
         """
         sums = self._wrenches
         sums.launch(force_cotangents, torque_cotangents)
+        if self.cells is not None:
+            self.cells.add_wrench(self.moments, force_cotangents, torque_cotangents, sums.by_positions, sums.by_moments)
         if self.coils is not None:
             self.coils.launch_wrench(force_cotangents, torque_cotangents, sums.by_positions, sums.by_moments)
         if self.solids is not None:
@@ -186,7 +198,7 @@ class SystemGradients:
         tangent.finish(None if by_field is None else self._given_field)
         self.fields.launch()
         if self.cells is not None:
-            self.cells.turn(self.moments, self.by_field, self.by_moments)
+            self.cells.add_solve(self.moments, self.by_field, self.by_positions, self.by_moments)
         if self.coils is not None:
             self.coils.launch_field(self.by_field, self.by_positions, self.by_moments)
         if self.solids is not None:

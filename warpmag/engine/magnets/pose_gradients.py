@@ -29,7 +29,6 @@ def _check_gradients(name: str, system: MomentSystem, sources: ModelSources) -> 
         f"the force {settings.force!r}": settings.force != "kelvin",
         f"the dynamics {settings.dynamics!r}": settings.dynamics != "theta",
         f"the contact model {settings.contact_model!r}": settings.contact_model != "dipole",
-        "the force between bodies of cells": system.crowded is not None,
         "the near field of a permanent body at cells of iron": _closed_forms_act_on_cells(system),
         "a coil with a resistance, whose current follows from voltages,": sources.circuits is not None,
         "recoil permeability": system.bias is not None,
@@ -147,9 +146,7 @@ class _SolvedMoments:
     def load(self) -> None:
         """Compute gradients at this state."""
         gradients = self._system.gradients
-        gradients.load(self.positions, self._moments, self._h, self._external_field)
-        if self._rotations is not None:
-            wp.copy(gradients.cells.rotations, self._rotations)
+        gradients.load(self.positions, self._moments, self._h, self._external_field, self._rotations)
         if self._coils is not None and gradients.coils is not None:
             wp.copy(gradients.coils.frames, self._coils[0])
             wp.copy(gradients.coils.strengths, self._coils[1])
