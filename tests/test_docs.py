@@ -30,7 +30,8 @@ FILE = re.compile(r"^```(?:xml)?\n((?:#usda 1\.0\n# |<!-- )(\S+).*?)^```$", re.M
 COMMAND = re.compile(r"^(?:pip install uv && uv run )?(warpmag .*)$", re.MULTILINE)
 SLOW = (
     *("physics.md", "physics/equilibrium.md", "physics/bodies.md", "physics/coils.md"),
-    *(f"howto/{name}.md" for name in ("coils", "design", "energy", "gradients", "holding", "mujoco", "newton")),
+    *(f"howto/{name}.md" for name in ("coils", "design", "energy", "gradients", "holding")),
+    *(f"howto/{name}.md" for name in ("material", "mujoco", "newton", "switch")),
     *(f"tutorials/{name}.md" for name in ("blender", "coils", "robot")),
 )
 """Pages that take long, most of them to compile kernels that no other test needs; ``.ci/run`` runs them, too."""

@@ -87,6 +87,7 @@ class KeyedCurrents:
     Example:
         >>> import newton
         >>> import warpmag
+        >>> import warpmag.usd  # registers the schemas
         >>> from pxr import Usd
         >>> stage = Usd.Stage.CreateInMemory()  # 24 time codes a second
         >>> coil = stage.DefinePrim("/Coil", "Xform")
