@@ -100,7 +100,7 @@ def check(gradient, function, step, tolerance):
 SCENES = {
     "ball": ((("box",), 0.0), {"ball": {"magnetization": MAGNETIZATION}}, 1e-5),
     "apart": ((("box", "box"), 0.03), {}, 1e-5),
-    "near": ((("box", "cylinder"), 0.021), {}, 1e-2),  # the sums over points of faces at a gap of 5 mm
+    "near": ((("box", "cylinder"), 0.021), {}, 1e-5),
 }
 
 

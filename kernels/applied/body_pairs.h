@@ -76,14 +76,45 @@ CUDA_CALLABLE inline Wrench wrench_on_moments(const Arrays& arrays, const Perman
     return wrench;
 }
 
-// Force/μ0, torque/μ0 and energy/μ0 of body s on body q, less those between their moments in the system. ``charges`` is
-// true for the surface charges of q, false for its moments; ``closed`` for the closed form of s. The torque is about
-// the first moment of q; all results are in the world's frame.
+// Two bodies: q, the smaller one, whose charges or moments are summed, in the field of s. ``near`` is true where the
+// pair differs from that of the moments in the system, ``charges`` for the surface charges of q, false for its moments,
+// ``closed`` for the closed form of s.
+struct BodyPair {
+    PermanentBody q, s;
+    bool first_is_q, near, charges, closed;
+};
+// The pair of two bodies, of which the one that ``precedes`` counts as smaller if both are of a size. Both bodies then
+// sum the same points, so that action and reaction are bitwise equal.
+CUDA_CALLABLE inline BodyPair body_pair(const PermanentBody& body, const PermanentBody& other, bool precedes) {
+    const bool is_smaller = body.radius < other.radius || (body.radius == other.radius && precedes);
+    BodyPair pair = {is_smaller ? body : other, is_smaller ? other : body, is_smaller, false, false, false};
+    const PermanentBody &q = pair.q, &s = pair.s;
+    const Real3 &p = q.frame.origin, &x = q.frame.x, &y = q.frame.y, &z = q.frame.z, &d = q.box_center;
+    const Vector center = broadcast(p + d.x * x + (d.y * y + d.z * z));
+    const Number distance2 = box_distance2(s, s.frame.point_to_body(center));
+    auto is_within = [&](Real a, Real b) {
+        const Real reach = q.radius + (a > b ? a : b);
+        return any(distance2 < Number(Real(0)) + reach * reach);
+    };
+    pair.near = is_within(q.far_reach, s.far_reach) && body.label != other.label;
+    pair.charges = is_within(q.reach, q.reach), pair.closed = is_within(q.reach, s.reach);
+    return pair;
+}
+// Wrench of s on the charges or the moments of q. The torque is about ``center``.
 template <class Arrays>
-CUDA_CALLABLE inline void body_wrench(const Arrays& arrays, const PermanentBody& q, const PermanentBody& s,
-                                      bool charges, bool closed, Real3& force, Real3& torque, Real& energy) {
+CUDA_CALLABLE inline Wrench summed_wrench(const Arrays& arrays, const BodyPair& pair, Real3 center) {
+    return pair.charges ? wrench_on_charges(arrays, pair.q, pair.s, center)
+                        : wrench_on_moments(arrays, pair.q, pair.s, pair.closed, center);
+}
+
+// Force/μ0, torque/μ0 and energy/μ0 of body s on body q, less those between their moments in the system. The torque is
+// about the first moment of q; all results are in the world's frame.
+template <class Arrays>
+CUDA_CALLABLE inline void body_wrench(const Arrays& arrays, const BodyPair& pair, Real3& force, Real3& torque,
+                                      Real& energy) {
+    const PermanentBody &q = pair.q, &s = pair.s;
     const Real3 center = reference_point(arrays, q);
-    Wrench wrench = charges ? wrench_on_charges(arrays, q, s, center) : wrench_on_moments(arrays, q, s, closed, center);
+    Wrench wrench = summed_wrench(arrays, pair, center);
     const Number minus = Number(Real(-INVERSE_4PI));
     for (int i = q.first + WIDTH * share(); i < q.first + q.count; i += WIDTH * SHARES) {
         const size_t pitch = arrays.packed.strides[0] / sizeof(Real);

@@ -188,32 +188,21 @@ template <class Arrays> CUDA_CALLABLE inline void react(const Arrays& arrays, in
     add_force_torque(out, force, torque, -MU0);
 }
 
-// Adds the wrenches of other permanent bodies on body b. Both bodies of a pair integrate the surface charges of the
-// smaller body, so that action and reaction are bitwise equal.
+// Adds the wrenches of other permanent bodies on body b.
 template <class Arrays>
 CUDA_CALLABLE inline void add_body_pairs(const Arrays& arrays, int b, Real (&total)[WRENCH_ROW]) {
     const PermanentBody body = body_at(arrays, b);
     const auto& world = arrays.solids.world.data[b]; // the bodies of its world
     for (int c = world[0]; c < world[1]; ++c) {
         if (c == b) continue;
-        const PermanentBody other = body_at(arrays, c);
-        if (other.label == body.label) continue;
-        const bool is_smaller = body.radius < other.radius || (body.radius == other.radius && b < c);
-        const PermanentBody &q = is_smaller ? body : other, &s = is_smaller ? other : body;
-        const Real3 &p = q.frame.origin, &x = q.frame.x, &y = q.frame.y, &z = q.frame.z, &d = q.box_center;
-        const Vector center = broadcast(p + d.x * x + (d.y * y + d.z * z));
-        const Number distance2 = box_distance2(s, s.frame.point_to_body(center));
-        auto is_within = [&](Real a, Real b) {
-            const Real reach = q.radius + (a > b ? a : b);
-            return any(distance2 < Number(Real(0)) + reach * reach);
-        };
-        if (!is_within(q.far_reach, s.far_reach)) continue;
+        const BodyPair pair = body_pair(body, body_at(arrays, c), b < c);
+        if (!pair.near) continue;
         Real3 force, torque;
         Real energy;
-        body_wrench(arrays, q, s, is_within(q.reach, q.reach), is_within(q.reach, s.reach), force, torque, energy);
-        if (is_smaller) add_force_torque(total, force, torque, MU0);
+        body_wrench(arrays, pair, force, torque, energy);
+        if (pair.first_is_q) add_force_torque(total, force, torque, MU0);
         else {
-            const Real3 arm_torque = cross(reference_point(arrays, q) - reference_point(arrays, s), force);
+            const Real3 arm_torque = cross(reference_point(arrays, pair.q) - reference_point(arrays, pair.s), force);
             add_force_torque(total, force, torque + arm_torque, -MU0);
         }
         total[6] += Real(0.5) * MU0 * energy;

@@ -16,7 +16,7 @@ moment. A function Σ η·C of the field in the induction is that of moments η:
 η, over μ0. Both are linear in the magnetization of each body, so that two values give its gradient.
 
 Derivatives along v are central differences in double precision, along a motion of a millionth of a body. Forces between
-two bodies are sums over points on their faces, and their second derivatives commute only as exactly as these sums.
+two bodies are sums over points, whose second derivatives commute only about: ``body_pair_gradients`` adds the rest.
 """
 
 from dataclasses import replace
@@ -25,6 +25,7 @@ from functools import cache
 import numpy as np
 import warp as wp
 
+from warpmag.kernels.applied.body_pair_gradients import BodyPairGradients
 from warpmag.kernels.applied.fields import AppliedForces
 from warpmag.kernels.applied.sources import FieldSources
 from warpmag.kernels.pairs.packing import PackedMoments
@@ -281,6 +282,10 @@ class SolidGradients:
         self._by_rotations, self._by_magnetizations = (
             wp.zeros(len(solids), dtype=wp.vec3d, device=device) for _ in range(2)
         )
+        motion = self._state.velocity, self._state.rotation
+        self._pairs = BodyPairGradients(
+            self._forces.arrays, self._sources.solid_worlds, *motion, self._by_positions, self._by_rotations
+        )
         self.frames = wp.clone(sources.solid_frames)
         self.by_rotations = wp.zeros(len(solids), dtype=wp.types.vector(3, self._dtype), device=device)
 
@@ -337,6 +342,7 @@ class SolidGradients:
             self._launch(_add_difference, sign, *results, self._by_positions, self._by_moments, self._by_rotations)
         self._evaluate(0.0)
         self._launch(_add_commutators, self._torque, self._forces.acting, self._by_moments, self._by_rotations)
+        self._pairs.launch()
         self._add(self._by_positions, by_positions)
         self._add(self._by_moments, by_moments)
         self._add(self._by_rotations, self.by_rotations)
