@@ -266,7 +266,7 @@ def draw(lines: list[dict], path: Path) -> None:
 
     from bench.report import machine_of  # noqa: PLC0415
 
-    figure, (cost, error, both) = plt.subplots(1, 3, figsize=(12.6, 4.2), layout="constrained")
+    figure, (cost, error, both) = plt.subplots(3, 1, figsize=(6.3, 10.5), layout="constrained")
     of_part = {part: [line for line in lines if line["part"] == part] for part in PARTS}
     for case in CASES:
         points = [line for line in of_part["gaps"] if (line["object"], line["contact_model"]) == case and line["gap"]]
@@ -297,7 +297,7 @@ def draw(lines: list[dict], path: Path) -> None:
         if axis.get_legend_handles_labels()[0]:
             axis.legend(fontsize="x-small")
     figure.suptitle(f"{machine_of(lines[0])}, commit {lines[0]['commit']}", fontsize="small")
-    figure.savefig(path, dpi=90, pil_kwargs={"optimize": True})
+    figure.savefig(path, dpi=120, pil_kwargs={"optimize": True})
     plt.close(figure)
 
 

@@ -45,7 +45,9 @@ nitpick_ignore_regex = [("py:mod", ".*"), ("py:.*", r"(?!warpmag\.[A-Za-z_]+$).*
 
 def _schemas() -> str:
     """Return tables of the attributes of all schemas."""
-    layer = Sdf.Layer.FindOrOpen(str(ROOT / "warpmag" / "usd" / "schema" / "generatedSchema.usda"))
+    layer = Sdf.Layer.FindOrOpen(
+        str(ROOT / "warpmag" / "usd" / "schema" / "generatedSchema.usda")
+    )
     return "\n".join(_schema(prim) for prim in layer.rootPrims)
 
 
@@ -57,13 +59,19 @@ def _schema(prim) -> str:
         allowed = ", ".join(f"`{token}`" for token in attribute.allowedTokens or ())
         tokens = f" One of {allowed}." if allowed else ""
         default = "" if attribute.default in (None, "") else f"`{attribute.default}`"
-        lines.append(f"| `{attribute.name}` | {kind} | {default} | {_one_line(attribute.documentation)}{tokens} |")
+        lines.append(
+            f"| `{attribute.name}` | {kind} | {default} | {_one_line(attribute.documentation)}{tokens} |"
+        )
     return "\n".join([*lines, ""])
 
 
 def _one_line(text: str) -> str:
     """Return the documentation of a schema in one line of Markdown."""
-    return " ".join(text.split()).replace("Range: ", "<br>Range: ").replace(" Units: ", "<br>Units: ")
+    return (
+        " ".join(text.split())
+        .replace("Range: ", "<br>Range: ")
+        .replace(" Units: ", "<br>Units: ")
+    )
 
 
 def _commands() -> str:
@@ -71,8 +79,14 @@ def _commands() -> str:
     os.environ["COLUMNS"] = "84"
     parser = cli._parser()
     (commands,) = (action.choices for action in parser._subparsers._group_actions)
-    parsers = {"warpmag": parser, **{f"warpmag {name}": command for name, command in commands.items()}}
-    return "\n".join(f"## {name}\n\n```text\n{command.format_help()}```\n" for name, command in parsers.items())
+    parsers = {
+        "warpmag": parser,
+        **{f"warpmag {name}": command for name, command in commands.items()},
+    }
+    return "\n".join(
+        f"## {name}\n\n```text\n{command.format_help()}```\n"
+        for name, command in parsers.items()
+    )
 
 
 def _file(name: str) -> str:
@@ -80,7 +94,9 @@ def _file(name: str) -> str:
     text = (ROOT / name).read_text(encoding="utf-8").replace("```mermaid", "```text")
     text = re.sub(r"\[([^]]+)\]\(docs/([\w/]+\.md)\)", r"[\1](\2)", text)
     return re.sub(
-        r"\[([^]]+)\]\(([\w.]+)\)", lambda link: f"[{link[1]}]({FILES[link[2]]})" if link[2] in FILES else link[1], text
+        r"\[([^]]+)\]\(([\w.]+)\)",
+        lambda link: f"[{link[1]}]({FILES[link[2]]})" if link[2] in FILES else link[1],
+        text,
     )
 
 
@@ -92,13 +108,22 @@ FILES = {
     "warpmag/examples/README.md": "examples.md",
 }
 """Files outside this folder that become pages, and the names of the pages."""
-GENERATED = {"schemas": _schemas, "command": _commands, **{name: partial(_file, name) for name in FILES}}
+GENERATED = {
+    "schemas": _schemas,
+    "command": _commands,
+    **{name: partial(_file, name) for name in FILES},
+}
 """Generated texts by name: ``<!-- name -->`` in a page is replaced by the text."""
 
 
 def _fill_in(app, page, source):
     names = "|".join(map(re.escape, GENERATED))
-    source[0] = re.sub(rf"^<!-- ({names}) -->$", lambda marker: GENERATED[marker[1]](), source[0], flags=re.MULTILINE)
+    source[0] = re.sub(
+        rf"^<!-- ({names}) -->$",
+        lambda marker: GENERATED[marker[1]](),
+        source[0],
+        flags=re.MULTILINE,
+    )
 
 
 FIGURE = re.compile(r"(\d+e-\d+|\d+ (?:%|[mµ]?[msTNJA]|[kM]?Hz|A/m|G?B)(?!\w))")
@@ -108,11 +133,15 @@ FIGURE = re.compile(r"(\d+e-\d+|\d+ (?:%|[mµ]?[msTNJA]|[kM]?Hz|A/m|G?B)(?!\w))"
 def _keep_figures_in_a_line(app, page, *_):
     """Mark figures of a page, so that ``static/page.css`` forbids a line break before a unit or in an exponent."""
     for text in list(page.findall(nodes.Text)):
-        if isinstance(text.parent, (nodes.literal, nodes.literal_block, nodes.math)) or not FIGURE.search(text):
+        if isinstance(
+            text.parent, (nodes.literal, nodes.literal_block, nodes.math)
+        ) or not FIGURE.search(text):
             continue
         parts = enumerate(FIGURE.split(text))
         marked = [
-            nodes.inline("", part, classes=["figure"]) if k % 2 else nodes.Text(part) for k, part in parts if part
+            nodes.inline("", part, classes=["figure"]) if k % 2 else nodes.Text(part)
+            for k, part in parts
+            if part
         ]
         text.parent.replace(text, marked)
 

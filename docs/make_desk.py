@@ -10,7 +10,13 @@ from pathlib import Path
 import bpy  # pyright: ignore[reportMissingImports] - Blender as a module
 
 FILE = Path(__file__).parent / "tutorials" / "desk.usdc"
-NUTS = ((0.0, 0.0), (0.022, 0.004), (-0.02, 0.012), (0.006, -0.022), (-0.012, -0.018))  # m
+NUTS = (
+    (0.0, 0.0),
+    (0.022, 0.004),
+    (-0.02, 0.012),
+    (0.006, -0.022),
+    (-0.012, -0.018),
+)  # m
 POSES = {1: 0.09, 24: 0.024, 36: 0.024, 60: 0.09}  # frame: height of the disc [m]
 
 
@@ -20,7 +26,10 @@ def material(name, color, metallic, roughness):
     new.use_nodes = True
     values = new.node_tree.nodes["Principled BSDF"].inputs
     values["Base Color"].default_value = (*color, 1.0)
-    values["Metallic"].default_value, values["Roughness"].default_value = metallic, roughness
+    values["Metallic"].default_value, values["Roughness"].default_value = (
+        metallic,
+        roughness,
+    )
     return new
 
 
@@ -52,7 +61,10 @@ def main():
     for frame, height in POSES.items():
         disc.location.z = height
         disc.keyframe_insert("location", frame=frame)
-    bpy.ops.object.camera_add(location=(0.16, -0.22, 0.14), rotation=(math.radians(63.0), 0.0, math.radians(36.0)))
+    bpy.ops.object.camera_add(
+        location=(0.16, -0.22, 0.14),
+        rotation=(math.radians(63.0), 0.0, math.radians(36.0)),
+    )
     scene = bpy.context.scene
     scene.camera = bpy.context.object
     scene.frame_start, scene.frame_end, scene.render.fps = 1, 60, 24

@@ -60,10 +60,18 @@ def write(folder: Path) -> None:
     """Write the film from the pictures in a folder."""
     from PIL import Image  # noqa: PLC0415 - not in Blender's Python
 
-    pictures = [Image.open(path).convert("RGB") for path in sorted(folder.glob("*.png"))]
+    pictures = [
+        Image.open(path).convert("RGB") for path in sorted(folder.glob("*.png"))
+    ]
     durations = [1000 // RATE] * (len(pictures) - 1) + [HOLD]
     pictures[0].save(
-        FILM, save_all=True, append_images=pictures[1:], duration=durations, loop=0, quality=QUALITY, method=6
+        FILM,
+        save_all=True,
+        append_images=pictures[1:],
+        duration=durations,
+        loop=0,
+        quality=QUALITY,
+        method=6,
     )
 
 
@@ -76,7 +84,9 @@ def main() -> None:
         folder = Path(name)
         stage = simulate(folder)
         python = os.environ.get("WARPMAG_BLENDER", sys.executable)
-        subprocess.run([python, "-P", __file__, "--draw", str(stage), str(folder)], check=True)
+        subprocess.run(
+            [python, "-P", __file__, "--draw", str(stage), str(folder)], check=True
+        )
         write(folder)
 
 

@@ -23,9 +23,19 @@ from warpmag.show.ray_tracing import ModelRenderer
 DOCS = Path(__file__).parent
 FOLDER = DOCS / "pictures" / "gallery"
 SIZE = (720, 404)  # px; a phone shows 360 points of two pixels
-SCENES = {"alphabets": 120, "balls_up": 60, "crystal_balls": 0, "falling_magnet": 90, "sakura_tree": 100}
+SCENES = {
+    "alphabets": 120,
+    "balls_up": 60,
+    "crystal_balls": 0,
+    "falling_magnet": 90,
+    "sakura_tree": 100,
+}
 """Scenes, and the number of frames to run; 0 for a scene at rest, which has a still."""
-OPTIONS = {"worlds": "--world-count 5", "compass_swarm": "--columns 1 --rows 8", "sorter": "--coils 3"}
+OPTIONS = {
+    "worlds": "--world-count 5",
+    "compass_swarm": "--columns 1 --rows 8",
+    "sorter": "--coils 3",
+}
 """Options of examples that are too large for a small picture."""
 VIEWS = {
     "compass_swarm": (0.6, 0.0, 0.8),
@@ -42,7 +52,11 @@ SLOW = {"levitation": 5, "worlds": 3}
 _RATE = 25.0  # pictures per second of slow motion
 _MOST = 40
 """Largest number of pictures of an example."""
-IRON, MAGNET, GROUND = (0.62, 0.63, 0.65), (0.75, 0.06, 0.05), (0.62, 0.63, 0.62)  # sRGB
+IRON, MAGNET, GROUND = (
+    (0.62, 0.63, 0.65),
+    (0.75, 0.06, 0.05),
+    (0.62, 0.63, 0.62),
+)  # sRGB
 
 
 class Camera(newton.viewer.ViewerNull):
@@ -70,8 +84,13 @@ class Camera(newton.viewer.ViewerNull):
         drawn = copy.copy(model)
         self._offsets = np.outer(np.maximum(model.body_world.numpy(), 0), self.pitch)
         drawn.body_q = wp.array(self._moved(model.body_q), dtype=wp.transform)
-        frames, static = model.shape_transform.numpy().copy(), model.shape_body.numpy() < 0
-        frames[static, :3] += np.outer(np.maximum(model.shape_world.numpy()[static], 0), self.pitch)
+        frames, static = (
+            model.shape_transform.numpy().copy(),
+            model.shape_body.numpy() < 0,
+        )
+        frames[static, :3] += np.outer(
+            np.maximum(model.shape_world.numpy()[static], 0), self.pitch
+        )
         drawn.shape_transform = wp.array(frames, dtype=wp.transform)
         drawn.shape_world, drawn.bvh_shapes = wp.zeros_like(model.shape_world), None
         drawn.shape_color = wp.clone(model.shape_color)
@@ -103,7 +122,9 @@ def film_scene(name: str) -> None:
     film = FOLDER / f"{name}.webp"
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / f"{name}.usda"
-        warpmag.Simulation(scenes_usd.bundled()[name]).run(SCENES[name], output=str(run))
+        warpmag.Simulation(scenes_usd.bundled()[name]).run(
+            SCENES[name], output=str(run)
+        )
         warpmag.render(run, film, size=SIZE)
 
 
@@ -113,7 +134,9 @@ def film_example(name: str) -> None:
     options = Example.create_parser().parse_args(OPTIONS.get(name, "").split())
     camera = Camera(num_frames=options.num_frames)
     camera.pitch, camera.view = PITCHES.get(name, camera.pitch), VIEWS.get(name)
-    rate = (_draw_steps if name in SLOW else _draw_frames)(Example(camera, options), SLOW.get(name, options.num_frames))
+    rate = (_draw_steps if name in SLOW else _draw_frames)(
+        Example(camera, options), SLOW.get(name, options.num_frames)
+    )
     films.write(FOLDER / f"{name}.webp", camera.pictures, [], rate)
 
 
@@ -146,7 +169,11 @@ def picture(name: str) -> str:
     """Return the path of a film from the page, or of the finished picture of a scene without one."""
     film = FOLDER / f"{name}.webp"
     drawn = film.exists() and film.stat().st_size > 0
-    return (film if drawn else DOCS / "pictures" / f"{name}.jpg").relative_to(DOCS).as_posix()
+    return (
+        (film if drawn else DOCS / "pictures" / f"{name}.jpg")
+        .relative_to(DOCS)
+        .as_posix()
+    )
 
 
 def page() -> str:
@@ -157,7 +184,11 @@ def page() -> str:
     )
     entries = [(f"warpmag run {name}", scene_line(name), name) for name in SCENES]
     examples_of = [
-        (f"python -m warpmag.examples {name}", line.rstrip(".") + " (slow motion)" * (name in SLOW), name)
+        (
+            f"python -m warpmag.examples {name}",
+            line.rstrip(".") + " (slow motion)" * (name in SLOW),
+            name,
+        )
         for name, line in examples.get_examples().items()
     ]
     sections = (("Scenes", entries), ("Examples", examples_of))

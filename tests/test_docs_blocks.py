@@ -16,6 +16,8 @@ from warpmag.cli import main
 BLOCK = re.compile(r"^```([\w{}-]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 FRAGMENT = re.compile(r"^def \w+ \"")
 """A prim of a stage."""
+COLUMNS = 88
+"""Columns of a block that a page shows without scrolling, at 1,400 pixels."""
 RUN = ("README.md", "docs/command.md", "docs/howto/stages.md", "docs/tutorials/blender.md")
 """Pages whose commands run as they stand."""
 LEFT_OUT = {
@@ -47,7 +49,7 @@ def blocks(page: Path):
 
 def commands(page: Path) -> list[str]:
     """Return the lines of the blocks of commands of a page."""
-    plain = [text for language, text in blocks(page) if not language]
+    plain = [text.replace("\\\n", "") for language, text in blocks(page) if not language]
     return [
         line
         for text in plain
@@ -69,6 +71,12 @@ def test_no_block_is_left_out_without_a_reason(page):
         assert any(re.match(pattern, line) for pattern in LEFT_OUT), line
     snippets, run = SNIPPET.findall(page.read_text(encoding="utf-8")), program(page)
     assert name in BEYOND or all(snippet.strip() in run for snippet in snippets)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)], ids=name_of)
+def test_lines_of_code_fit_the_page(page):
+    lines = [line for _, text in blocks(page) for line in text.splitlines()]
+    assert [line for line in lines if len(line) > COLUMNS] == []
 
 
 def test_reasons_are_needed():
