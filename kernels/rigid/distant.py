@@ -1,9 +1,10 @@
-"""Bodies of iron with few moments while every other magnet is far from them: the choice by worlds, and the cells.
+"""Bodies of iron with few moments while other magnets keep a distance: the choice by worlds, and the cells.
 
-Two systems have the moments of all bodies: one with the cells of these bodies, one with few moments in their place. In
-each world one system is solved and the other rests. The few moments act where all bodies are far from other moments,
-and no moment comes near saturation, which cells reach one by one. A body changes to its few moments only beyond
-``_RETURN`` times the distance at which it returns to its cells, so that it does not change back and forth.
+Several systems have the moments of all bodies. The last one has the cells of these bodies, each earlier one, a level,
+has few moments in their place: the fewest at level 0, for the largest distances. In each world one system is solved and
+the others rest. A level acts where all bodies are far enough from other moments, and no moment comes near saturation,
+which cells reach one by one. A world changes to a level of fewer moments only beyond ``_RETURN`` times the distance at
+which it returns, so that it does not change back and forth.
 """
 
 import warp as wp
@@ -14,7 +15,7 @@ from warpmag.kernels.rigid.newton_views import body_pose
 wp.set_module_options({"enable_backward": False})
 
 _RETURN = 1.1
-"""Ratio of the distances at which a body changes to few moments, and back to cells."""
+"""Ratio of the distances at which a body changes to fewer moments, and back."""
 _LINEAR = 0.45, 0.55
 """Largest magnetization of the cells at which a body changes to few moments, and of these at which it keeps them, in
 saturations."""
@@ -23,7 +24,7 @@ _THREADS = 32  # threads of a GPU that measure the distances from a body
 
 @wp.struct
 class DistantBodies:
-    """Bodies with few moments, b of them with n cells and k moments in all, in the frames of the bodies."""
+    """Bodies with few moments at a level, b of them with n cells and k moments in all, in the frames of the bodies."""
 
     body: wp.array[wp.int32]  # body of the model, -1 for the world, shape [b]
     world: wp.array[wp.int32]  # world, shape [b]
@@ -31,12 +32,12 @@ class DistantBodies:
     sources: wp.array[wp.vec2i]  # range of all moments of its world in that system, shape [b]
     lower: wp.array[wp.vec3]  # corners of a box around the cells [m], shape [b]
     upper: wp.array[wp.vec3]
-    reach: wp.array[float]  # distance of other moments from the box at which it returns to cells [m], shape [b]
+    reach: wp.array2d[float]  # distance of other moments from the box at which each level ends [m], shape [b, levels]
     table: wp.array[wp.vec3i]  # first entries of its shape in ``coefficients`` and ``patterns``, and n, shape [b]
     coefficients: wp.array[float]  # from few moments to strengths of patterns, shapes [patterns, 3 k], flat
     patterns: wp.array[float]  # magnetizations of cells at unit strengths, shapes [3, patterns, n], flat
-    pattern_count: int
-    strengths: wp.array2d[float]  # strengths of the patterns, shape [b, patterns]
+    pattern_count: wp.array[wp.int32]  # number of patterns, shape [b]
+    strengths: wp.array2d[float]  # strengths of the patterns, shape [b, largest number of patterns]
     same: wp.array[wp.int32]  # for each of the few moments, one of the same magnet in the system of cells
     rotation: wp.array[wp.int32]  # index of its rotation in the system of few moments, shape [b]
     source: wp.array[wp.int32]  # the same moment of the other system, or -1, for moments of the system of cells
@@ -46,26 +47,23 @@ class DistantBodies:
 
 @wp.struct
 class WorldChoice:
-    """Choice between both systems in w worlds."""
+    """Choice among s systems, those of the levels and that of cells, in w worlds."""
 
-    many_rest: wp.array[wp.int32]  # 1 where the system of cells rests, shape [w]
-    few_rest: wp.array[wp.int32]  # 1 where the other one rests, shape [w]
-    many_rested: wp.array[wp.int32]  # 1 where the system of cells rested before this choice, shape [w]
-    many_begin: wp.array[wp.int32]  # 1 where the system of cells starts to act, shape [w]
-    few_begin: wp.array[wp.int32]  # 1 where the other one does, shape [w]
-    is_near: wp.array[wp.int32]  # 1 where a body has a magnet near it, or there is no such body, shape [w]
-    always_near: wp.array[wp.int32]  # 1 where there is no such body, shape [w]
+    level: wp.array[wp.int32]  # number of the system that acts, shape [w]
+    before: wp.array[wp.int32]  # that before this choice, shape [w]
+    nearest: wp.array[wp.int32]  # the least one that distances and saturation allow, shape [w]
+    always_near: wp.array[wp.int32]  # 1 where no body has few moments, shape [w]
     saturated: wp.array[wp.int32]  # 1 where a moment came near saturation in the last solve, shape [w]
-    any_many_begin: wp.array[wp.int32]  # 1 if the system of cells starts to act in any world, shape [1]
-    any_few_begin: wp.array[wp.int32]  # 1 if the other one does, shape [1]
-    any_many: wp.array[wp.int32]  # 1 if the system of cells acts in any world, shape [1]
-    any_few: wp.array[wp.int32]  # 1 if the other one does, shape [1]
+    acting: wp.array[wp.int32]  # for each system whether it acts in any world, and starts to do so, shape [2 s]
 
 
 @wp.struct
 class SystemArrays:
     """Arrays of a system of n moments in w worlds (``moments.system.MomentSystem``)."""
 
+    number: int  # of the system
+    resting: wp.array[wp.int32]  # 0 where it acts, shape [w]
+    begins: wp.array[wp.int32]  # 1 where it starts to act, shape [w]
     positions: wp.array[wp.vec3]  # [m], shape [n]
     radii: wp.array[float]  # [m], shape [n]
     saturation: wp.array[float]  # [A/m], shape [n]
@@ -81,18 +79,14 @@ class SystemArrays:
 
 
 @wp.kernel
-def _begin_choice(choice: WorldChoice, bodies: DistantBodies, many: SystemArrays, few: SystemArrays):
+def _begin_choice(choice: WorldChoice):
     i = wp.tid()
-    if i < choice.is_near.shape[0]:
-        choice.is_near[i] = wp.max(choice.always_near[i], choice.saturated[i])
+    if i < choice.level.shape[0]:
+        choice.before[i] = choice.level[i]
+        choice.nearest[i] = wp.max(choice.always_near[i], choice.saturated[i]) * (choice.acting.shape[0] // 2 - 1)
         choice.saturated[i] = 0
-    if i < few.external_field.shape[0]:
-        few.external_field[i] = many.external_field[bodies.same[i]]
-    if i == 0:
-        choice.any_many[0] = 0
-        choice.any_few[0] = 0
-        choice.any_many_begin[0] = 0
-        choice.any_few_begin[0] = 0
+    if i < choice.acting.shape[0]:
+        choice.acting[i] = 0
 
 
 @wp.kernel
@@ -106,76 +100,80 @@ def _measure_distances(
     b = wp.tid() // threads
     inverse = wp.transform_inverse(body_pose(body_q_in, bodies.body[b]))
     world = bodies.world[b]
-    reach = bodies.reach[b]
-    if choice.few_rest[world] != 0:
-        reach = wp.static(_RETURN) * reach
-    near = int(0)
+    cells = bodies.reach.shape[1]
+    level = int(0)
     for i in range(bodies.sources[b][0] + wp.tid() % threads, bodies.sources[b][1], threads):
         if i < bodies.own[b][0] or i >= bodies.own[b][1]:
             x = wp.transform_point(inverse, few.positions[i])
             outside = x - wp.min(wp.max(x, bodies.lower[b]), bodies.upper[b])
-            if not wp.length(outside) - few.radii[i] > reach:
-                near = 1
-    if near == 1:
-        wp.atomic_max(choice.is_near, world, 1)
-
-
-@wp.func
-def _act_by_cells(choice: WorldChoice, w: int):
-    """Let the system of cells act in a world."""
-    rested = choice.many_rested[w]
-    choice.many_rest[w] = 0
-    choice.few_rest[w] = 1
-    choice.many_begin[w] = rested
-    wp.atomic_max(choice.any_many_begin, 0, rested)
-    wp.atomic_max(choice.any_many, 0, 1)
+            distance = wp.length(outside) - few.radii[i]
+            while level < cells:
+                reach = bodies.reach[b, level]
+                if level < choice.before[world]:
+                    reach = wp.static(_RETURN) * reach
+                if distance > reach:
+                    break
+                level += 1
+    if level > 0:
+        wp.atomic_max(choice.nearest, world, level)
 
 
 @wp.kernel
 def _choose(allowed: int, choice: WorldChoice):
     w = wp.tid()
-    choice.many_rested[w] = choice.many_rest[w]
-    choice.many_begin[w] = 0
-    choice.few_begin[w] = 0
-    if choice.is_near[w] != 0 or allowed == 0:
-        _act_by_cells(choice, w)
-    else:
-        choice.few_begin[w] = choice.few_rest[w]
-        wp.atomic_max(choice.any_few_begin, 0, choice.few_rest[w])
-        wp.atomic_max(choice.any_few, 0, 1)
-        choice.many_rest[w] = 1
-        choice.few_rest[w] = 0
+    choice.level[w] = choice.nearest[w]
+    if allowed == 0:
+        choice.level[w] = choice.acting.shape[0] // 2 - 1
 
 
 @wp.kernel
-def _find_saturated(
-    moments: SystemArrays, resting: wp.array[wp.int32], limit: float, saturated_out: wp.array[wp.int32]
-):
+def _let_act(choice: WorldChoice, system: SystemArrays):
+    w = wp.tid()
+    acts = int(choice.level[w] == system.number)
+    begins = acts * int(choice.before[w] != system.number)
+    system.resting[w] = 1 - acts
+    system.begins[w] = begins
+    if acts != 0:
+        wp.atomic_max(choice.acting, 2 * system.number, 1)
+    if begins != 0:
+        wp.atomic_max(choice.acting, 2 * system.number + 1, 1)
+
+
+@wp.kernel
+def _set_external_field(bodies: DistantBodies, cells: SystemArrays, few: SystemArrays):
+    i = wp.tid()
+    few.external_field[i] = cells.external_field[bodies.same[i]]
+
+
+@wp.kernel
+def _find_saturated(moments: SystemArrays, limit: float, saturated_out: wp.array[wp.int32]):
     i = wp.tid()
     world = moments.replaced[i]
     if world < 0:
         return
-    if resting[world] == 0 and wp.length(moments.moments[i]) > limit * moments.volumes[i] * moments.saturation[i]:
+    strength = wp.length(moments.moments[i])
+    if moments.resting[world] == 0 and strength > limit * moments.volumes[i] * moments.saturation[i]:
         wp.atomic_max(saturated_out, world, 1)
 
 
 @wp.kernel
-def _finish_few(choice: WorldChoice, few: SystemArrays, many: SystemArrays):
+def _finish_few(choice: WorldChoice, few: SystemArrays, cells: SystemArrays):
     w = wp.tid()
-    if choice.few_rest[w] != 0:
+    if few.resting[w] != 0:
         return
-    many.error[w] = few.error[w]
-    many.residual[w] = few.residual[w]
-    many.evaluations[w] = few.evaluations[w]
-    many.converged[w] = few.converged[w]
+    cells.error[w] = few.error[w]
+    cells.residual[w] = few.residual[w]
+    cells.evaluations[w] = few.evaluations[w]
+    cells.converged[w] = few.converged[w]
     if choice.saturated[w] != 0:
-        _act_by_cells(choice, w)
+        choice.level[w] = cells.number
+        few.resting[w] = 1
 
 
 @wp.kernel
-def _find_strengths(bodies: DistantBodies, choice: WorldChoice, few: SystemArrays):
+def _find_strengths(bodies: DistantBodies, few: SystemArrays):
     b, pattern = wp.tid()
-    if choice.few_rest[bodies.world[b]] != 0:
+    if few.resting[bodies.world[b]] != 0 or pattern >= bodies.pattern_count[b]:
         return
     rotation = few.rotations[bodies.rotation[b]]
     first = bodies.own[b][0]
@@ -194,92 +192,102 @@ def _spread_moments(
     body_q_in: wp.array[wp.transform],
     magnets: BodyMoments,
     bodies: DistantBodies,
-    choice: WorldChoice,
     few: SystemArrays,
-    many: SystemArrays,
+    cells: SystemArrays,
 ):
     i = wp.tid()
-    if choice.few_rest[bodies.moment_world[i]] != 0:
+    if few.resting[bodies.moment_world[i]] != 0:
         return
-    many.positions[i] = wp.transform_point(body_pose(body_q_in, magnets.body[i]), magnets.local_positions[i])
+    cells.positions[i] = wp.transform_point(body_pose(body_q_in, magnets.body[i]), magnets.local_positions[i])
     if bodies.source[i] >= 0:
-        many.moments[i] = few.moments[bodies.source[i]]
+        cells.moments[i] = few.moments[bodies.source[i]]
         return
     b = bodies.cell[i][0]
     if b < 0:
         return
-    cells = bodies.table[b][2]
+    count = bodies.table[b][2]
     entry = bodies.table[b][1] + bodies.cell[i][1]
     m = wp.vec3()
     for c in range(3):
-        for pattern in range(bodies.pattern_count):
+        for pattern in range(bodies.pattern_count[b]):
             m[c] += bodies.patterns[entry] * bodies.strengths[b, pattern]
-            entry += cells
-    many.moments[i] = many.volumes[i] * wp.quat_rotate(few.rotations[bodies.rotation[b]], m)
+            entry += count
+    cells.moments[i] = cells.volumes[i] * wp.quat_rotate(few.rotations[bodies.rotation[b]], m)
 
 
 class DistantLaunches:
-    """Launches of the choice between two systems of moments, and of the results of one for the other.
+    """Launches of the choice among systems of moments, and of the results of one for the others.
 
     Args:
-        bodies: The bodies with few moments.
+        bodies: The bodies with few moments at each level.
         choice: The choice of each world, which the launches write.
         magnets: The moments of the system of cells on their bodies.
-        many, few: The system of cells, and that of few moments.
+        systems: The systems of the levels, and that of cells.
     """
 
     def __init__(
-        self,
-        bodies: DistantBodies,
-        choice: WorldChoice,
-        magnets: BodyMoments,
-        many: SystemArrays,
-        few: SystemArrays,
+        self, bodies: list[DistantBodies], choice: WorldChoice, magnets: BodyMoments, systems: list[SystemArrays]
     ):
         """Record the launches that need no poses."""
-        self._bodies, self._choice, self._magnets, self._many, self._few = bodies, choice, magnets, many, few
-        self._device, worlds = few.moments.device, len(choice.is_near)
+        self._bodies, self._choice, self._magnets, self._systems = bodies, choice, magnets, systems
+        self._device, worlds = choice.level.device, len(choice.level)
+        levels, cells = list(zip(bodies, systems, strict=False)), systems[-1]
 
         def record(kernel, dim, *inputs):
             return wp.launch(kernel, dim, inputs=inputs, device=self._device, record_cmd=True)
 
-        self._begin = record(_begin_choice, max(worlds, len(few.moments)), choice, bodies, many, few)
+        self._begin = record(_begin_choice, max(worlds, len(choice.acting)), choice)
         self._choose = [record(_choose, worlds, allowed, choice) for allowed in (0, 1)]
-        self._finish_few = [
-            record(_find_saturated, len(few.moments), few, choice.few_rest, _LINEAR[1], choice.saturated),
-            record(_finish_few, worlds, choice, few, many),
+        self._let_act = [record(_let_act, worlds, choice, system) for system in systems]
+        self._set_field = [
+            record(_set_external_field, len(few.moments), of_level, cells, few) for of_level, few in levels
         ]
-        self._finish_many = record(
-            _find_saturated, len(many.moments), many, choice.many_rest, _LINEAR[0], choice.saturated
-        )
-        self._find_strengths = record(_find_strengths, bodies.strengths.shape, bodies, choice, few)
+        self._find_saturated = [
+            record(_find_saturated, len(system.moments), system, _LINEAR[system is not cells], choice.saturated)
+            for system in systems
+        ]
+        self._finish_few = [record(_finish_few, worlds, choice, few, cells) for _, few in levels]
+        self._find_strengths = [
+            record(_find_strengths, of_level.strengths.shape, of_level, few) for of_level, few in levels
+        ]
 
     def choose(self, body_q, *, allowed: bool) -> None:
         """Choose the system of each world from the distances of moments to the bodies at the poses ``body_q``.
 
-        The system with few moments gets the external field of the other one. With ``allowed`` False the system of
-        cells acts in all worlds.
+        With ``allowed`` False the system of cells acts in all worlds.
         """
         self._begin.launch()
-        threads = _THREADS if self._device.is_cuda else 1
-        inputs = [body_q, self._bodies, self._few, threads, self._choice]
-        wp.launch(_measure_distances, threads * len(self._bodies.body), inputs=inputs, device=self._device)
+        threads, bodies = _THREADS if self._device.is_cuda else 1, self._bodies[0]
+        inputs = [body_q, bodies, self._systems[0], threads, self._choice]
+        wp.launch(_measure_distances, threads * len(bodies.body), inputs=inputs, device=self._device)
         self._choose[allowed].launch()
-
-    def finish_few(self) -> None:
-        """Copy the results of the solve of few moments, and let cells act where a moment is near saturation."""
-        for launch in self._finish_few:
+        for launch in self._let_act:
             launch.launch()
 
-    def finish_many(self) -> None:
+    def set_external_field(self, level: int) -> None:
+        """Copy the external field of the system of cells to that of a level."""
+        self._set_field[level].launch()
+
+    def finish_few(self, level: int) -> None:
+        """Copy the results of the solve of a level, and choose cells where one of its moments is near saturation."""
+        self._find_saturated[level].launch()
+        self._finish_few[level].launch()
+
+    def let_cells_act(self) -> None:
+        """Let the system of cells act where it is chosen."""
+        self._let_act[-1].launch()
+
+    def finish_cells(self) -> None:
         """Mark the worlds where a cell is near saturation after a solve of the system of cells."""
-        self._finish_many.launch()
+        self._find_saturated[-1].launch()
 
     def spread_moments(self, body_q) -> None:
         """Write positions and moments of the system of cells where it rests, at the poses ``body_q``.
 
         The moments of cells follow from the few moments.
         """
-        self._find_strengths.launch()
-        inputs = [body_q, self._magnets, self._bodies, self._choice, self._few, self._many]
-        wp.launch(_spread_moments, len(self._many.moments), inputs=inputs, device=self._device)
+        cells = self._systems[-1]
+        for bodies, few, find_strengths in zip(self._bodies, self._systems, self._find_strengths, strict=False):
+            find_strengths.launch()
+            inputs = [body_q, self._magnets, bodies, few, cells]
+            wp.launch(_spread_moments, len(cells.moments), inputs=inputs, device=self._device)

@@ -1,10 +1,9 @@
-"""Few moments that replace a body of iron while every source of a field is far from it.
+"""Few moments that replace a body of iron while every source of a field keeps a distance from it.
 
-The potential of sources outside of a sphere around the body is a sum of harmonic polynomials there. Their share in the
-force falls off as (a/d)^l with the degree l, the size a of the body, and the distance d. Let F be the gradients of the
-polynomials up to a degree at the cells, R the response of the cells to any field (``demagnetization.py``), and
-Q = FᵀRF. Moments at few points with the gradients E there act like the cells up to that degree if their response P has
-EᵀPE = Q. With the pseudoinverse E⁺,
+Fields of sources beyond a surface around the body are those of charges on that surface. Over the body they vary slowly:
+few combinations of them, F at the cells, span all others up to a tolerance. Let R be the response of the cells to any
+field (``demagnetization.py``), and Q = FᵀRF. Moments at few points with the same fields E there act like the cells up
+to the tolerance if their response P has EᵀPE = Q. With the pseudoinverse E⁺,
 
     P = E⁺ᵀ Q E⁺ + ε (1 − E E⁺),
 
@@ -13,11 +12,14 @@ term lets the moments respond to other fields as well, so that P has an inverse:
 curve like cells. Their own field is T = (1/3 − P⁻¹)/V, since a ball of ideal permeability has the response 3. The
 points are means of cells, so that they are inside the body.
 
-With degree 4 and up to 27 points the force of a dipole differs by up to 1 % from that on the cells, at
-:data:`DISTANT_REACH` (``tests/test_distant_bodies.py``). Degree 2, the dipole and the quadrupole, leaves up to 10 %
-there: the moment that a field of degree 3 induces acts as much as the quadrupole.
+There are several levels, :data:`FEW_LEVELS`: the nearer the surface, the more combinations and points. The distance
+that a body needs follows from the forces of ball magnets whose diameter is their distance from the body, which act as
+dipoles: it is where their error, which falls off with the third power of the distance or faster, is at most
+:data:`BALL_ERROR`. That is the largest error of several places and directions. The median is a fifth of it, and larger
+magnets have less.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,17 +27,30 @@ import numpy as np
 from warpmag.shapes.demagnetization import Coupling, full_tensors, pair_law_tensors
 from warpmag.shapes.uniform_response import cell_matrix
 
-DISTANT_REACH = 3.0
-"""Smallest distance of sources from the body's box, in halves of its longest side."""
-MOST_POINTS = 27
-"""Largest number of moments: 3 × 3 × 3 in a cube, 5 × 5 in a plate."""
+
+@dataclass(frozen=True)
+class Level:
+    """Number of moments that replace a body, and the distance of the surface of charges."""
+
+    distance: float  # from the body's box, in halves of its longest side
+    most_points: int  # largest number of moments
+
+
+FEW_LEVELS = Level(3.0, 27), Level(0.7, 100), Level(0.3, 196)
+"""From far to near. 27 points are 3 × 3 × 3 in a cube and 5 × 5 in a plate."""
+BALL_ERROR = 0.05
+"""Largest relative error of the force of a ball magnet at the smallest distance, which is its diameter."""
 LEAST_REPLACED_CELLS = 65
 """Smallest number of cells of a body that few moments replace."""
 MOST_REPLACED_CELLS = 1000
 """Largest number of cells of bodies that get few moments. More would need a larger matrix than 72 MB."""
-_DEGREE = 4
-_LEAST_GRADIENT = 0.01
-"""Least singular value of E over that of the cells: polynomials that vary less over the points get no response."""
+_SOURCE_SPACING = 0.75
+"""Largest distance of the charges on the surface, in distances of the surface from the body."""
+_LEAST_FIELD = 0.003
+"""Least strength of a combination of fields at the cells, and of one at the points, over the largest. Weaker ones get
+no response."""
+_TESTS = 24
+"""Number of dipoles whose forces are compared."""
 _OTHER_RESPONSE = 1.0
 """Response ε to other fields: that of a sheet across itself."""
 
@@ -62,95 +77,135 @@ class DistantBody:
     volumes: np.ndarray  # [m³], shape [k]
     lower: np.ndarray  # corners of a box around the cells [m], shape [3]
     upper: np.ndarray
-    coefficients: np.ndarray  # from the moments to the strengths of p polynomials [A/m], shape [p, 3 k]
+    coefficients: np.ndarray  # from the moments to the strengths of p fields [A/m], shape [p, 3 k]
     patterns: np.ndarray  # magnetizations of the cells at unit strengths, shape [3, p, n]
 
-    @property
-    def reach(self) -> float:
-        """Smallest distance of sources from the box [m]."""
-        return DISTANT_REACH * 0.5 * float((self.upper - self.lower).max())
+    reach: float  # smallest distance of sources from the box [m]
 
 
-def distant_body(body, coupling: Coupling) -> DistantBody | None:
-    """Return the few moments of a body, or None if rounding leaves no response.
+def distant_bodies(body, coupling: Coupling) -> list[DistantBody] | None:
+    """Return the few moments of a body at each level, or None if rounding leaves no response.
+
+    The levels are the first of :data:`FEW_LEVELS`, while the body has more than twice as many cells as moments.
 
     Args:
         body: The cells, with ``positions`` [m], ``volumes`` [m³] and ``radii`` [m].
         coupling: Tensors between the cells.
     """
-    volumes, center, extent = body.volumes, coupling.center, coupling.extent
-    part = _parts(body.positions)
-    shares = np.bincount(part, volumes)
-    points = np.stack([np.bincount(part, volumes * x) for x in body.positions.T], axis=1) / shares[:, None]
-    cells, few = (_scaled_fields((x - center) / extent, v) for x, v in ((body.positions, volumes), (points, shares)))
-    norms = np.linalg.norm(cells, axis=0)
-    norms[norms == 0.0] = 1.0  # a wire has polynomials that vanish along it
+    levels = [level for level in FEW_LEVELS if 2 * level.most_points < len(body.volumes)]
+    charges = [_charges(*_box(body), level.distance) for level in levels]
     try:
-        patterns = _solve(body, coupling, cells / norms)
-        left, values, right = np.linalg.svd(few / norms, full_matrices=False)
-        rank = int((values > _LEAST_GRADIENT * values[0]).sum())
-        left, inverse = left[:, :rank], (right[:rank].T / values[:rank]) @ left[:, :rank].T
-        response = inverse.T @ (cells / norms).T @ patterns @ inverse
-        other = _OTHER_RESPONSE * (np.eye(len(left)) - left @ left.T)
-        inverse_response = np.linalg.inv(0.5 * (response + response.T) + other)
+        bases = [_basis(_scaled_fields(body.positions, body.volumes, x)) for x in charges]
+        balls = [_charges(*_box(body), 1.5 * level.distance) for level in levels]
+        tests = [_Tests.at(x, body.positions, body.volumes) for x in balls]
+        fields = [fields for (cells, _), test in zip(bases, tests, strict=True) for fields in (cells, test.fields)]
+        ends = np.cumsum([field.shape[1] for field in fields])[:-1]
+        responses = np.split(_solve(body, coupling, np.hstack(fields)), ends, axis=1)
+        parts = zip(levels, charges, balls, bases, tests, responses[::2], responses[1::2], strict=True)
+        bodies = [_few_moments(body, *part) for part in parts]
     except np.linalg.LinAlgError:
         return None
+    return None if None in bodies else bodies  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class _Tests:
+    """Fields of dipoles at points and their gradients, times the roots of volumes, shapes [3 n, t] and [3 n, 3, t]."""
+
+    fields: np.ndarray
+    gradients: np.ndarray
+
+    @classmethod
+    def at(cls, places: np.ndarray, points: np.ndarray, volumes: np.ndarray) -> "_Tests":
+        """Return the fields of dipoles at some of ``places``, in the directions of axes."""
+        chosen = np.unique(np.linspace(0, len(places) - 1, _TESTS).astype(int))
+        axis, unit = np.arange(len(chosen)) % 3, np.eye(3)
+        r = points[:, None] - places[chosen]
+        d, m, along = np.linalg.norm(r, axis=2)[..., None], unit[axis], r[:, np.arange(len(chosen)), axis, None]
+        fields = 3.0 * r * along / d**5 - m / d**3
+        outer = r[..., :, None] * m[:, None] + m[:, :, None] * r[..., None, :] + along[..., None] * unit
+        gradients = 3.0 * outer / d[..., None] ** 5 - 15.0 * (along * r / d**7)[..., None] * r[..., None, :]
+        root = np.sqrt(volumes)[:, None, None]
+        fields, gradients = (root * fields).transpose(0, 2, 1), (root[..., None] * gradients).transpose(0, 2, 3, 1)
+        return cls(fields.reshape(-1, len(chosen)), gradients.reshape(-1, 3, len(chosen)))
+
+    def forces(self, magnetizations: np.ndarray) -> np.ndarray:
+        """Return the forces of the dipoles on magnetizations times the roots of volumes, shape [3, t]."""
+        return np.einsum("ikt,it->kt", self.gradients, magnetizations)
+
+
+def _few_moments(
+    body, level: Level, charges: np.ndarray, balls: np.ndarray, basis, tests: _Tests, patterns, magnetized
+) -> DistantBody | None:
+    """Return the moments of a level.
+
+    ``basis`` is :func:`_basis` at the cells, ``patterns`` are their magnetizations. ``tests`` are the fields of dipoles
+    at ``balls`` there, and ``magnetized`` their magnetizations.
+    """
+    volumes, part, (cells, combinations) = body.volumes, _parts(body.positions, level.most_points), basis
+    shares = np.bincount(part, volumes)
+    points = np.stack([np.bincount(part, volumes * x) for x in body.positions.T], axis=1) / shares[:, None]
+    left, values, right = np.linalg.svd(_scaled_fields(points, shares, charges) @ combinations, full_matrices=False)
+    rank = int((values > _LEAST_FIELD * values[0]).sum())
+    left, inverse = left[:, :rank], (right[:rank].T / values[:rank]) @ left[:, :rank].T
+    response = inverse.T @ cells.T @ patterns @ inverse
+    response = 0.5 * (response + response.T) + _OTHER_RESPONSE * (np.eye(len(left)) - left @ left.T)
+    inverse_response = np.linalg.inv(response)
     if not (
         np.isfinite(inverse_response).all()
         and np.isfinite(patterns).all()
         and np.linalg.eigvalsh(inverse_response)[0] > 0.0
     ):
         return None  # cells of wires of lengths beyond 1e9 radii
+    few, expected = _Tests.at(balls, points, shares), tests.forces(magnetized)
+    error = np.linalg.norm(few.forces(response @ few.fields) - expected, axis=0) / np.linalg.norm(expected, axis=0)
     root, cell_root = np.repeat(np.sqrt(shares), 3), np.repeat(np.sqrt(volumes), 3)
     patterns = (patterns / cell_root[:, None]).reshape(len(volumes), 3, -1)
+    lower, upper = _box(body)
+    distance = level.distance * 0.5 * float((upper - lower).max())
     return DistantBody(
-        _coupling(points, shares, inverse_response / (root[:, None] * root)), shares, *_box(body),
+        _coupling(points, shares, inverse_response / (root[:, None] * root)), shares, lower, upper,
         coefficients=inverse @ inverse_response / root, patterns=patterns.transpose(1, 2, 0).copy(),
+        reach=distance * max(1.0, float(np.cbrt(error.max() / BALL_ERROR))),
     )  # fmt: skip
 
 
-def _scaled_fields(points: np.ndarray, volumes: np.ndarray) -> np.ndarray:
-    """Return :func:`harmonic_fields` times the roots of volumes, shape [3 n, 24]."""
-    return (np.sqrt(volumes)[:, None, None] * harmonic_fields(points)).reshape(3 * len(points), -1)
+def _charges(lower: np.ndarray, upper: np.ndarray, distance: float) -> np.ndarray:
+    """Return points at a distance from a box, in halves of its longest side, all around it, shape [s, 3]."""
+    distance = distance * 0.5 * (upper - lower).max()
+    sides = upper - lower + 2.0 * distance
+    grid = [np.linspace(-0.5, 0.5, 1 + math.ceil(side / (_SOURCE_SPACING * distance))) * side for side in sides]
+    points = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = 0.5 * (lower + upper) + points[(np.abs(points) > 0.499 * sides).any(axis=1)]
+    nearest = np.clip(points, lower, upper)
+    outward = points - nearest
+    return nearest + distance * outward / np.linalg.norm(outward, axis=1)[:, None]
 
 
-def harmonic_fields(points: np.ndarray) -> np.ndarray:
-    """Return gradients of harmonic polynomials up to degree 4 at points, shape [n, 3, 24].
-
-    The polynomials of degree l are a basis of the kernel of the Laplace operator among all polynomials of that degree.
-    """
-    fields = [np.broadcast_to(np.eye(3), (len(points), 3, 3))]
-    for degree in range(2, _DEGREE + 1):
-        powers, lower = _powers(degree), _powers(degree - 2)
-        laplacian = np.zeros((len(lower), len(powers)))
-        gradients = np.zeros((len(points), 3, len(powers)))
-        for column, power in enumerate(powers):
-            for axis in range(3):
-                once, twice = power - np.eye(3, dtype=int)[axis], power - 2 * np.eye(3, dtype=int)[axis]
-                if once[axis] >= 0:
-                    gradients[:, axis, column] = power[axis] * np.prod(points**once, axis=1)
-                if twice[axis] >= 0:
-                    row = int(np.flatnonzero((lower == twice).all(axis=1))[0])
-                    laplacian[row, column] += power[axis] * once[axis]
-        basis = np.linalg.svd(laplacian)[2][len(lower) :]
-        fields.append(gradients @ basis.T)
-    return np.concatenate(fields, axis=2)
+def _scaled_fields(points: np.ndarray, volumes: np.ndarray, charges: np.ndarray) -> np.ndarray:
+    """Return the fields r/r³ of charges at points, times the roots of volumes, shape [3 n, charges]."""
+    r = points[:, None] - charges
+    fields = np.sqrt(volumes)[:, None, None] * r / np.linalg.norm(r, axis=2)[:, :, None] ** 3
+    return fields.transpose(0, 2, 1).reshape(3 * len(points), -1)
 
 
-def _powers(degree: int) -> np.ndarray:
-    """Return the powers of x, y and z of all monomials of a degree, shape [m, 3]."""
-    return np.array([(i, j, degree - i - j) for i in range(degree + 1) for j in range(degree + 1 - i)])
+def _basis(fields: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the strongest orthogonal combinations of fields, shape [3 n, p], and their coefficients, [fields, p]."""
+    norms = np.linalg.norm(fields, axis=0)
+    squares, combinations = np.linalg.eigh((fields / norms).T @ (fields / norms))
+    combinations = combinations[:, squares > _LEAST_FIELD**2 * squares[-1]] / norms[:, None]
+    return fields @ combinations, combinations
 
 
-def _parts(positions: np.ndarray) -> np.ndarray:
-    """Return a number for each cell: that of its box in a grid of at most ``MOST_POINTS`` boxes, nearly cubes."""
+def _parts(positions: np.ndarray, most: int) -> np.ndarray:
+    """Return a number for each cell: that of its box in a grid of at most ``most`` boxes, nearly cubes."""
     lower, sides = positions.min(axis=0), np.ptp(positions, axis=0)
     sides = np.maximum(sides, 1e-6 * sides.max())
     spacing, counts = sides.max(), np.ones(3, int)
     while True:
         spacing *= 0.98
         finer = np.maximum(np.rint(sides / spacing).astype(int), 1)
-        if finer.prod() > MOST_POINTS:
+        if finer.prod() > most:
             break
         counts = finer
     index = np.minimum(((positions - lower) / sides * counts).astype(int), counts - 1)

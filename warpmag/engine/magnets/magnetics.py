@@ -50,9 +50,9 @@ from warpmag.terminal import collection_paused
 class Magnetics:
     """The magnets of a Newton model: their induction, forces and fields.
 
-    A ball is one moment. Any other shape is a lattice of moments with the exact volume, or few moments in its place
-    where every other magnet is far from it. Moments of one body exert no forces on each other, and magnets of different
-    worlds do not interact. Use any solver that reads ``State.body_f``::
+    A ball is one moment. Any other shape is a lattice of moments with the exact volume, or fewer moments in its place
+    where every other magnet keeps a distance. Moments of one body exert no forces on each other, and magnets of
+    different worlds do not interact. Use any solver that reads ``State.body_f``::
 
         magnetics = warpmag.Magnetics(model)
         ...
@@ -164,8 +164,8 @@ class Magnetics:
 
     @property
     def _systems(self) -> list[MomentSystem]:
-        """The system, and that with few moments in place of cells."""
-        return [self.system] if self._distant is None else [self.system, self._distant.few.system]
+        """The system, and those with few moments in place of cells."""
+        return [self.system] if self._distant is None else self._distant.systems
 
     @property
     def device(self) -> wp.Device:
@@ -348,7 +348,7 @@ class Magnetics:
         if not int(flags) & int(newton.ModelFlags.SHAPE_PROPERTIES):
             return
         changed = self._values.changed_materials()
-        for placed in [self._placed] if self._distant is None else [self._placed, self._distant.few]:
+        for placed in (self._placed, *(self._distant.levels if self._distant is not None else ())):
             moment_shapes = placed.table.shape.numpy()
             affected = np.isin(moment_shapes, changed) & ~placed.table.permanent.numpy()
             affected[placed.recoiling.numpy()] = False
@@ -547,8 +547,7 @@ class Magnetics:
         """
         self._check_solved()
         self.check_model()
-        rest = self._distant is not None and self._distant.rest_everywhere()
-        return workload(self, self._distant.few if rest else self._placed)
+        return workload(self, self._placed if self._distant is None else self._distant.most_moments())
 
     def _check_solved(self) -> None:
         """Raise :class:`InputError` before the first solve, warn if the last one did not converge."""
