@@ -5,6 +5,8 @@ import pytest
 import warp as wp
 
 import warpmag
+from warpmag.kernels.pairs import mirror_cuda, pair_gradients
+from warpmag.kernels.pairs.packing import PackedMoments
 
 EXACT = 1e-5
 """Relative error of central differences: their own, about 1e-8, and that of float64 sums, with a margin."""
@@ -263,3 +265,30 @@ def test_nothing_is_recorded_without_need(device):
     assert not tape.launches and isinstance(field, np.ndarray)
     result = warpmag.h_field(warp_array(x, device), m, dtype="float64")  # no tape
     assert not result.requires_grad
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("slabs", [1, 100])
+@pytest.mark.parametrize("of_forces", [False, True])
+def test_pairs_visited_once_on_a_gpu(of_forces, slabs, device, monkeypatch):
+    """Mirrored tiles, also in several passes, agree with sums by targets; balls overlap, bodies have three balls."""
+    count, rng = 403, np.random.default_rng(0)
+    x, vectors = rng.uniform(0.0, 0.05, (count, 3)), rng.normal(size=(4, count, 3))
+    radii = wp.array(rng.uniform(0.002, 0.003, count), dtype=wp.float64, device=device)
+    labels = np.arange(count) // 3 if of_forces else None
+    moments = PackedMoments(radii, largest_radius=0.003, labels=labels)
+    x, m, v, a, h = (wp.array(part, dtype=wp.vec3d, device=device) for part in (x, *vectors))
+    moments.pack(x, m)
+    cotangents = None if of_forces else moments.twin()
+    if cotangents is not None:
+        cotangents.pack(x, v)
+    results = []
+    for least in (count + 1, 0):
+        monkeypatch.setattr(pair_gradients, "_LEAST_MIRRORED", least)
+        monkeypatch.setattr(mirror_cuda, "_SLAB_BYTES", slabs * 36 * count)
+        given = {"external_field": h} if cotangents is None else {"cotangents": cotangents.moments}
+        sums = pair_gradients.PairGradients(moments, [0, count], **given)
+        sums.launch(*((a, v) if of_forces else ()))
+        results.append(np.array([sums.by_positions.numpy(), sums.by_moments.numpy()]))
+    for expected, values in zip(*results, strict=True):
+        assert np.linalg.norm(values - expected) < 1e-12 * np.linalg.norm(expected)

@@ -120,8 +120,10 @@ class PairEvaluation:
             self._launch_sums = lambda a: launch_reference_sums(finished, a, smoothing)
             return 1, ()
         if self.form == MIRRORED:
-            mirror = mirror_cuda.make_mirror(int(segments[0, 0]), count, quantity, targets.dtype, device, self._ranks)
-            self._launch_sums = lambda a: mirror_cuda.launch_pair_loop_mirrored(mirror, a.sources, a.partial)
+            shape = mirror_cuda.shape_for(quantity, count)
+            plan = int(segments[0, 0]), count, shape, targets.dtype, device
+            mirror = mirror_cuda.make_mirror(*plan, ranks=self._ranks)
+            self._launch_sums = lambda a: mirror_cuda.launch_pair_loop_mirrored(quantity, mirror, a.sources, a.partial)
             return mirror.slabs + mirror.splits, ()
         if self.form == FUSED:
             shape = fused_cuda.choose_fused_shape(finished, count)

@@ -60,7 +60,6 @@ class MirrorTiles:
 class Mirror:
     """Work list of moments among themselves, on one device."""
 
-    quantity: Quantity  # ``FIELD`` or ``MUTUAL_FORCE``
     shape: MirrorShape  # shape of the blocks
     tiles: MirrorTiles  # tiles and blocks
     # First block, number of blocks, and first distance between tiles of each launch.
@@ -69,16 +68,23 @@ class Mirror:
     splits: int  # number of blocks of a pass that share the walk of a home tile
 
 
-def make_mirror(origin: int, count: int, quantity: Quantity, dtype, device, ranks=None) -> Mirror:
-    """Plan the sums of ``count`` moments from packed column ``origin`` on, or the part of one process of ``ranks``."""
-    shape = next(shape for most, shape in _SHAPES[quantity] if most is None or count <= most)
+def shape_for(quantity: Quantity, count: int) -> MirrorShape:
+    """Return the fastest shape of the sums of ``count`` moments."""
+    return next(shape for most, shape in _SHAPES[quantity] if most is None or count <= most)
+
+
+def make_mirror(origin: int, count: int, shape: MirrorShape, dtype, device, *, numbers=3, ranks=None) -> Mirror:
+    """Plan the sums of ``count`` moments from packed column ``origin`` on, or the part of one process of ``ranks``.
+
+    A moment has partial sums of so many ``numbers``.
+    """
     if dtype is wp.float64 and shape.warps > _MOST_DOUBLE_WARPS:
         shape = replace(shape, warps=shape.warps // 2, blocks=2 * shape.blocks)
     tiles = max(math.ceil(count / (32 * shape.moments)), 3)
     tiles += 1 - tiles % 2
     stages = math.ceil(math.ceil(count / tiles) / 32)
     farthest = tiles // 2
-    slabs = min(farthest, max(1, _SLAB_BYTES // (12 * count)))
+    slabs = min(farthest, max(1, _SLAB_BYTES // (4 * numbers * count)))
     slabs = math.ceil(farthest / math.ceil(farthest / slabs))  # equal in all passes
     splits = _choose_splits(shape, tiles, stages * min(slabs + 1, farthest + 1), device.sm_count)
     several = slabs < farthest
@@ -102,7 +108,7 @@ def make_mirror(origin: int, count: int, quantity: Quantity, dtype, device, rank
     mirror_tiles.origin, mirror_tiles.stages, mirror_tiles.slabs = origin, stages, slabs
     mirror_tiles.edges = wp.array(count * np.arange(tiles + 1) // tiles, dtype=wp.int32, device=device)
     mirror_tiles.blocks = wp.array(np.concatenate(blocks), dtype=wp.int32, device=device)
-    return Mirror(quantity, shape, mirror_tiles, tuple(passes), slabs, splits)
+    return Mirror(shape, mirror_tiles, tuple(passes), slabs, splits)
 
 
 def _choose_splits(shape: MirrorShape, tiles: int, walk: int, multiprocessors: int) -> int:
@@ -132,10 +138,10 @@ def _kernel(dtype, quantity: Quantity, shape: MirrorShape):
     )
 
 
-def launch_pair_loop_mirrored(mirror: Mirror, packed, partial):
-    """Sum a quantity over all pairs; see ``evaluate``."""
+def launch_pair_loop_mirrored(quantity: Quantity, mirror: Mirror, packed, partial):
+    """Sum a quantity, ``FIELD`` or ``MUTUAL_FORCE``, over all pairs; see ``evaluate``."""
     block = 32 * mirror.shape.warps
-    kernel, device = _kernel(partial.dtype, mirror.quantity, mirror.shape), partial.device
+    kernel, device = _kernel(partial.dtype, quantity, mirror.shape), partial.device
     for first_block, blocks, nearest in mirror.passes:
         inputs = [packed, mirror.tiles, first_block, nearest]
         wp.launch(kernel, block * blocks, inputs=inputs, outputs=[partial], block_dim=block, device=device)

@@ -1,8 +1,10 @@
 // Gradients of functions of fields, forces and torques between moments; pair_gradients.py has the equations.
 //
 // From Python: INVERSE_4PI, MU0 [T·m/A], GROUP, the threads of a GPU that share a target, WRENCH, 1 for forces and
-// torques and 0 for fields, and TILE_SIZE. ``Arrays`` is the struct of pair_gradients.py. On a GPU each target visits
-// all sources of its world. On a CPU a pair is visited once, for both its moments, in tiles of the work list.
+// torques and 0 for fields, and TILE_SIZE. ``Arrays`` is the struct of pair_gradients.py. On a CPU a pair is visited
+// once, for both its moments, in tiles of the work list. On a GPU many moments of one world do the same
+// (``mirrored_gradients_cuda.h``), and the partial sums are added up here. Otherwise each target visits all sources of
+// its world.
 #pragma once
 #include "pairs/pair_law.h"
 #include "pairs/pair_terms.h"
@@ -114,7 +116,8 @@ struct Rows {
     const Real* data;
     size_t pitch;
 
-    CUDA_CALLABLE Rows(const wp::array_t<Real>& rows) : data(rows.data), pitch(rows.strides[0] / sizeof(Real)) {}
+    CUDA_CALLABLE Rows(const Real* data, size_t pitch) : data(data), pitch(pitch) {}
+    CUDA_CALLABLE Rows(const wp::array_t<Real>& rows) : Rows(rows.data, rows.strides[0] / sizeof(Real)) {}
     CUDA_CALLABLE Number lanes(int row, int i) const { return numbers(data + row * pitch + i); }
     CUDA_CALLABLE Vector vector(int row, int i) const { return {lanes(row, i), lanes(row + 1, i), lanes(row + 2, i)}; }
     // Number i in all lanes.
@@ -160,6 +163,21 @@ CUDA_CALLABLE inline void store_gradients(const Arrays& arrays, int first, int l
     }
 }
 
+// Row k of the partial sums of a part, from moment i on. Shape of ``partial``: [parts, ROWS, pitch].
+template <class Arrays> CUDA_CALLABLE inline Real* partial_row(const Arrays& arrays, int part, int k, int i) {
+    return arrays.partial.data + ((size_t)part * ROWS + k) * arrays.partial.shape[2] + i;
+}
+// Adds up the partial sums of a vector of moments, or of one that a group of threads shares, in order.
+template <class Arrays> CUDA_CALLABLE inline void finish_vector(const Arrays& arrays, int i) {
+    const int left = arrays.packed.shape[1] - i;
+    if (left <= 0) return;
+    GradientSums sums;
+    for (int part = share(); part < arrays.partial.shape[0]; part += SHARES)
+        for (int k = 0; k < ROWS; ++k) ((Number*)sums.part)[k] += numbers(partial_row(arrays, part, k, i));
+    for (auto& part : sums.part) part = group_sums(part);
+    if (share() == 0) store_gradients(arrays, i, left < WIDTH ? left : WIDTH, sums);
+}
+
 #if defined(__CUDA_ARCH__)
 // Writes the gradients of a moment, from its pairs with all moments of its world; a group of threads shares it.
 template <class Arrays> CUDA_CALLABLE inline void differentiate_target(const Arrays& arrays, int i) {
@@ -175,10 +193,6 @@ template <class Arrays> CUDA_CALLABLE inline void differentiate_target(const Arr
     store_gradients(arrays, i, share() == 0, sums);
 }
 #else
-// Row k of the partial sums of a part, from moment i on. Shape of ``partial``: [parts, ROWS, pitch].
-template <class Arrays> inline Real* partial_row(const Arrays& arrays, int part, int k, int i) {
-    return arrays.partial.data + ((size_t)part * ROWS + k) * arrays.partial.shape[2] + i;
-}
 template <class Arrays>
 inline void add_partial(const Arrays& arrays, int part, int i, int lane_count, const Number* sums) {
     for (int k = 0; k < ROWS; ++k) {
@@ -232,21 +246,14 @@ template <class Arrays> inline void sum_share(const Arrays& arrays, const TileEn
         if (tile->mirrored) sum_tile(arrays, *tile);
 }
 
-// Adds up the partial sums of a vector of moments in order.
-template <class Arrays> inline void finish_vector(const Arrays& arrays, int i) {
-    const int left = arrays.packed.shape[1] - i;
-    GradientSums sums;
-    for (int part = 0; part < arrays.partial.shape[0]; ++part)
-        for (int k = 0; k < ROWS; ++k) ((Number*)sums.part)[k] += numbers(partial_row(arrays, part, k, i));
-    store_gradients(arrays, i, left < WIDTH ? left : WIDTH, sums);
-}
 #endif
 
 // Writes the gradients of all moments.
 template <class Word, class Arrays>
 CUDA_CALLABLE inline void differentiate_pairs(int thread, int threads, Word* team, const Arrays& arrays) {
 #if defined(__CUDA_ARCH__)
-    differentiate_target(arrays, thread / GROUP);
+    if (arrays.partial.data) finish_vector(arrays, thread / GROUP);
+    else differentiate_target(arrays, thread / GROUP);
 #else
     const TileEntry* const tiles = (const TileEntry*)arrays.tiles.data;
     const int* const shares = arrays.shares.data; // first tile of each share

@@ -23,6 +23,7 @@ from functools import cache
 import numpy as np
 import warp as wp
 
+from warpmag.kernels.pairs.mirror_cuda import MirrorShape, MirrorTiles, make_mirror
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.work_list import TILE_COLUMNS, cpu_tiles, pair_count, target_rows, tile_size
 from warpmag.kernels.pairs.wrench import MU0
@@ -36,8 +37,9 @@ occupy all processors, while more moments load the sources less often with small
 
 _FEWEST_EVALUATED, _MOST_IN_ONE_SUM = 512, 4096
 """Fewest sources per moment for which a GPU computes gradients of fields faster as a field and two forces, in systems
-of more than so many moments: 1,000 balls take 0.9 times as long as their field in one sum and 1.9 times in three, 4,096
-balls 2.6 and 2.9 times, 16,384 balls 6.0 and 4.1 times (H200)."""
+of several worlds with more than so many moments."""
+_LEAST_MIRRORED, _MIRROR_SHAPE = 2048, MirrorShape(moments=2, warps=4, blocks=4, unrolled=1)
+"""Fewest moments of one world whose pairs a GPU evaluates once, for both their moments, and the shape of the blocks."""
 
 
 def one_sum_is_faster(device, pairs: float, count: int) -> bool:
@@ -45,7 +47,8 @@ def one_sum_is_faster(device, pairs: float, count: int) -> bool:
 
     ``pairs`` counts pairs of two moments, ``count`` moments.
     """
-    return device.is_cpu or count <= _MOST_IN_ONE_SUM or pairs < _FEWEST_EVALUATED * count
+    is_one_world = pairs >= count**2
+    return device.is_cpu or is_one_world or count <= _MOST_IN_ONE_SUM or pairs < _FEWEST_EVALUATED * count
 
 
 @cache
@@ -59,7 +62,7 @@ def _arrays_type(dtype):
         end: wp.array[int]
         tiles: wp.array2d[int]  # of a CPU, as in ``work_list``
         shares: wp.array[int]
-        partial: wp.array3d[dtype]  # partial sums of a CPU, shape [parts, rows, n or more]
+        partial: wp.array3d[dtype]  # partial sums of pairs that are visited once, shape [parts, rows, n or more]
         # Data in:
         packed: wp.array2d[dtype]  # moments, shape [8, n]
         cotangents: wp.array2d[dtype]  # v and, for forces, a, shape [3 or 6, n]
@@ -73,13 +76,29 @@ def _arrays_type(dtype):
     return PairGradientArrays
 
 
+def _constants(dtype, group: int, wrench: bool) -> dict:
+    constants = {"MU0": MU0, "INVERSE_4PI": INVERSE_4PI, "GROUP": group, "WRENCH": int(wrench)}
+    return constants | {"TILE_SIZE": tile_size(dtype)}
+
+
 @cache
 def _kernel(dtype, group: int, wrench: bool):
     call = "differentiate_pairs(thread, threads, team.data, arrays)"
-    arguments = {**PASS_ARGUMENTS, "arrays": _arrays_type(dtype)}
-    constants = {"MU0": MU0, "INVERSE_4PI": INVERSE_4PI, "GROUP": group, "WRENCH": int(wrench)}
-    constants["TILE_SIZE"] = tile_size(dtype)
+    arguments, constants = {**PASS_ARGUMENTS, "arrays": _arrays_type(dtype)}, _constants(dtype, group, wrench)
     return native_kernel(call, "pairs/pair_gradients.h", arguments, dtype=dtype, **constants)
+
+
+@cache
+def _mirrored_kernel(dtype, shape, wrench: bool):
+    return native_kernel(
+        f"sum_mirrored_gradients<{shape.moments}, {shape.warps}>"
+        "(first_block + blockIdx.x, threadIdx.x, arrays, tiles, nearest)",
+        "pairs/mirrored_gradients_cuda.h",
+        {"arrays": _arrays_type(dtype), "tiles": MirrorTiles, "first_block": int, "nearest": int},
+        dtype=dtype,
+        launch={"grid_stride": False, "launch_bounds": (32 * shape.warps, shape.blocks if dtype is wp.float32 else 1)},
+        **_constants(dtype, 1, wrench),
+    )
 
 
 @cache
@@ -133,10 +152,15 @@ class PairGradients:
         is_shared = device.is_cuda and n <= _MOST_SHARED and pair_count(segments) >= _LEAST_SHARED * n
         self._group = group_threads(device, long_lists=is_shared)
         _, a.begin, a.end = target_rows(segments, device)
+        self._mirror, parts = None, 0
         if device.is_cpu:
             tiles, shares, parts, self._threads = cpu_tiles(segments, True, dtype)
             a.tiles = wp.array(np.reshape(tiles, (-1, TILE_COLUMNS)), dtype=wp.int32, device=device)
             a.shares = wp.array(shares, dtype=wp.int32, device=device)
+        elif len(segments) == 1 and n >= _LEAST_MIRRORED:
+            self._mirror = make_mirror(0, n, _MIRROR_SHAPE, dtype, device, numbers=3 * len(out))
+            parts = self._mirror.slabs + self._mirror.splits
+        if parts:
             pitch = a.packed.strides[0] // a.packed.strides[1]
             a.partial = wp.zeros((parts, 3 * len(out), pitch), dtype=dtype, device=device)
 
@@ -149,5 +173,15 @@ class PairGradients:
             a.torque_cotangents = torque_cotangents
             inputs = [a.packed, force_cotangents, torque_cotangents]
             wp.launch(_cotangents_kernel(dtype), n, inputs=inputs, outputs=[a.cotangents], device=device)
+        if self._mirror is not None:
+            self._launch_mirrored(self._mirror)
         kernel = _kernel(dtype, self._group, self._is_wrench)
         launch_passes(kernel, 0, 1, a, device=device, threads=self._threads, gpu_threads=self._group * n)
+
+    def _launch_mirrored(self, mirror) -> None:
+        """Launch the partial sums of all pairs."""
+        a, block = self._arrays, 32 * mirror.shape.warps
+        kernel = _mirrored_kernel(a.packed.dtype, mirror.shape, self._is_wrench)
+        for first_block, blocks, nearest in mirror.passes:
+            inputs = [a, mirror.tiles, first_block, nearest]
+            wp.launch(kernel, block * blocks, inputs=inputs, device=self._device, block_dim=block)
