@@ -16,6 +16,8 @@ def test_tables_and_quoted_figures_follow_from_the_data():
     for path in page.PAGES:
         text = path.read_text(encoding="utf-8")
         assert text == page.filled(text, data), f"{path}: run python -m bench.page"
+        broken = re.search(r"^<!-- benchmark: \w+ -->.", text, re.MULTILINE)
+        assert not broken, f"{path}: a comment at the start of a line ends the paragraph"
 
 
 def test_times_of_benchmarked_sizes_are_quoted_from_the_data():
