@@ -64,10 +64,12 @@ class MomentLayout:
         A large body at the start or the end of its world's moments, as lone bodies of cells are, leaves out its own
         moments.
         """
-        rows = []
-        for first, last, begin, end in self.runs(selected):
-            bodies = self.bodies[begin:end]
-            front, back = (int(np.argmax(np.append(own != own[0], True))) for own in (bodies, bodies[::-1]))
+        runs, rows = self.runs(selected), []
+        begins, ends = np.reshape(runs, (-1, 4)).T[2:].astype(int)
+        edges = np.concatenate([[0], np.flatnonzero(np.diff(self.bodies)) + 1, [len(self.bodies)]])  # of bodies
+        fronts = np.minimum(edges[np.searchsorted(edges, begins, side="right")], ends) - begins
+        backs = ends - np.maximum(edges[np.searchsorted(edges, ends) - 1], begins)
+        for (first, last, begin, end), front, back in zip(runs, fronts.tolist(), backs.tolist(), strict=True):
             front, back = (count if count >= _LARGE_BODY else 0 for count in (front, back))
             if front == end - begin:  # a lone body
                 rows.append((first, last, end - 1, end))

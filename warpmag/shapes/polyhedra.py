@@ -13,7 +13,7 @@ continuous, so that a small interpenetration changes the force only a little.
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -238,6 +238,7 @@ def _gauss_points_on_face(corners: np.ndarray, longest: float, most: int) -> tup
     return positions.reshape(-1, 3), np.outer(areas, nodes * weights).ravel()
 
 
+@cache
 def _gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes and weights of Gauss-Legendre quadrature on [0, 1]."""
     nodes, weights = np.polynomial.legendre.leggauss(count)

@@ -36,7 +36,6 @@ def make_system(
     static = np.cumsum([magnet.body < 0 for magnet in magnets]) + model.body_count
     bodies = [magnet.body if magnet.body >= 0 else k for magnet, k in zip(magnets, static.tolist(), strict=True)]
     movable = [magnet.body >= 0 and not kinematic[magnet.body] for magnet in magnets]
-    moment_bodies, moments_move = per_moment(bodies, int), per_moment(movable, bool)
     solids = [
         (magnet.body, _solid_magnet(k, magnet, can_move, part))
         for k, magnet, can_move in zip(first, magnets, movable, strict=True)
@@ -47,8 +46,8 @@ def make_system(
         worlds=per_moment([magnet.world for magnet in magnets], int),
         permanent=per_moment([material.fixed for material in materials], bool),
         radii=np.concatenate([magnet.lattice.radii for magnet in magnets]),
-        bodies=moment_bodies,
-        movable=moments_move,
+        bodies=per_moment(bodies, int),
+        movable=per_moment(movable, bool),
         material=MomentMaterial(
             per_moment([material.saturation for material in materials]),
             per_moment([m.recoil_permeability - 1.0 if m.recoils else m.susceptibility for m in materials]),
@@ -62,7 +61,7 @@ def make_system(
         couplings=[(k, magnet.lattice.coupling) for k, magnet in coupled],
         solids=[solid for _, solid in solids],
         faces=[_iron_faces(number, k, magnet) for number, (k, magnet) in enumerate(coupled) if _has_faces(magnet)],
-        body_extent=_largest_extent(magnets, moment_bodies, moments_move),
+        body_extent=_largest_extent(magnets, np.array(bodies), np.array(movable)),
         sources=sources,
         device=model.device,
     )
@@ -92,12 +91,16 @@ def _solid_magnet(first: int, magnet: BodyMagnet, movable: bool, part) -> SolidM
 
 
 def _largest_extent(magnets: list[BodyMagnet], bodies: np.ndarray, movable: np.ndarray) -> float:
-    """Return an upper bound of the distance between moments of a movable body [m]; 0 if each has one moment."""
+    """Return an upper bound of the distance between moments of a movable body [m]; 0 if each has one moment.
+
+    ``bodies`` and ``movable`` have an entry for each magnet.
+    """
     if not movable.any():
         return 0.0
+    lattices = {id(magnet.lattice): magnet.lattice.positions for magnet in magnets}
+    boxes = {key: (positions.min(axis=0), positions.max(axis=0)) for key, positions in lattices.items()}
     order = np.flatnonzero(movable)[np.argsort(bodies[movable], kind="stable")]
-    positions = np.concatenate([magnet.lattice.positions for magnet in magnets])[order]
-    bodies = bodies[order]
-    starts = np.flatnonzero(np.diff(bodies, prepend=bodies[0] - 1))
-    low, high = np.minimum.reduceat(positions, starts), np.maximum.reduceat(positions, starts)
+    corners = np.array([boxes[id(magnets[k].lattice)] for k in order.tolist()])
+    starts = np.flatnonzero(np.diff(bodies[order], prepend=bodies[order[0]] - 1))
+    low, high = np.minimum.reduceat(corners[:, 0], starts), np.maximum.reduceat(corners[:, 1], starts)
     return float(np.linalg.norm(high - low, axis=1).max())
