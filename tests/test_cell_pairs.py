@@ -90,6 +90,26 @@ def test_fields_between_bodies_are_those_of_boxes(pose, dtype, device):
     assert error < {"float32": 2e-4, "float64": 1e-9}[dtype]  # boxes less balls, which nearly cancel when apart
 
 
+def test_shares_of_boxes_in_each_other():
+    """Boxes at random poses, compared with points that are inside: exact for parallel edges, 0 for disjoint boxes."""
+    rng, disjoint, inside = np.random.default_rng(3), 0, 0
+    for k in range(200):
+        turns = (
+            Rotation.random(2, rng).as_matrix() if k % 2 else np.tile(Rotation.random(rng=rng).as_matrix(), (2, 1, 1))
+        )
+        halves = np.exp(rng.uniform(-3.0, 0.0, (2, 3)))
+        a, b = ((place, *box) for place, *box in zip(rng.uniform(-0.5, 0.5, (2, 3)), turns, halves, strict=True))
+        points = a[0] + (a[2] * rng.uniform(-1.0, 1.0, (2000, 3))) @ a[1].T
+        sampled = (np.abs((points - b[0]) @ b[1]) <= b[2]).all(axis=1).mean()
+        share = boxes.overlap_share(a, b)
+        assert 0.0 <= share <= 1.0 + 1e-12
+        if k % 2 == 0 or sampled == 1.0:  # a mean of 2,000 points, at five standard deviations
+            assert share == pytest.approx(sampled, abs=0.056)
+        disjoint, inside = disjoint + (share == 0.0), inside + (share > 0.99)
+        assert share > 0.0 or sampled == 0.0
+    assert disjoint > 20 and inside > 2
+
+
 @pytest.mark.parametrize(
     ("cube", "pose"), [(CUBE, "touching"), (CUBE, "apart"), (FINE, "touching")], ids=["touching", "apart", "linear"]
 )

@@ -3,6 +3,8 @@
 from dataclasses import asdict
 
 import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
 
 from bench import heaps
 
@@ -14,6 +16,29 @@ def test_heaps_are_stable_and_balanced(device):
     assert len(verdicts) == 20 and sum(verdict.operator is not None for verdict in verdicts) > 4
     sums = np.array([[verdict.force_sum, verdict.torque_sum] for verdict in verdicts])
     assert np.median(sums) < 3e-7 and np.quantile(sums, 0.8) < 1e-6
+
+
+SHEETS = {
+    "inside": [((0.024, 0.024, 0.003), 0.0025, (0.0, 0.0, 0.0)), ((0.024, 0.024, 0.001), 0.0018, (0.0, 0.0, 0.0))],
+    "turned": [((0.024, 0.024, 0.0005), 0.0022, (0.0, 0.0, 0.0)), ((0.024, 0.024, 0.0005), 0.0022, (0.0, 0.0, 0.3))],
+    "across": [((0.024, 0.024, 0.003), 0.0025, (0.0, 0.0, 0.0)), ((0.024, 0.024, 0.001), 0.0018, (1.2, 0.0, 0.3))],
+}
+"""Sides [m], spacing of cells [m] and rotation vector of intersecting sheets."""
+
+
+@pytest.mark.parametrize("which", SHEETS)
+def test_sheets_that_intersect_are_stable(which, device):
+    """Cells of sheets far wider than thick reach into each other, though no inscribed balls of theirs do."""
+    iron = {"susceptibility": 1000.0, "saturation": 1e9}
+    pieces = [
+        heaps.Piece(
+            heaps.Geometry("plate", np.array(sides) / 2.0, spacing, None), np.zeros(3), Rotation.from_rotvec(turn), iron
+        )
+        for sides, spacing, turn in SHEETS[which]
+    ]
+    (verdict,) = heaps.SolvedHeaps([heaps.Heap(pieces, np.array([0.0, 1e3, 500.0]))], device).verdicts(0, 400)
+    assert verdict.passes and verdict.operator is not None
+    assert verdict.demagnetization is not None and verdict.demagnetization > 0.0
 
 
 def test_heaps_have_all_shapes_and_materials():

@@ -4,6 +4,7 @@ The windows are those of ``warpmag.kernels.cells.cell_pairs``; all formulas are 
 """
 
 import itertools
+import math
 
 import numpy as np
 
@@ -84,7 +85,34 @@ def pair_correction(a, b, window, close) -> np.ndarray:
     return fade(distance, window) * tensor
 
 
-def body_corrections(cells, bodies, window, close, overlap_demagnetization: float, full_depth: float) -> np.ndarray:
+def overlap_share(a, b) -> float:
+    """Share of the volume of box a inside box b, as ``box_overlap.h`` estimates it.
+
+    It is the smaller one of the volumes that a box shares with the bounding box of the other one. Disjoint boxes have
+    disjoint projections on an edge, or on a normal of two edges. So the least common part of the projections on
+    normals, over that on edges, is a factor of at most 1.
+
+    Args:
+        a, b: Boxes: position [m], rotation matrix, half sides [m].
+    """
+    r = b[0] - a[0]
+
+    def common(axis):
+        """Length of the common part of the projections on an axis, and over the shorter projection."""
+        own, other = (2.0 * np.abs(axis @ turn) @ half for _, turn, half in (a, b))
+        length = max(min(0.5 * (own + other) - abs(axis @ r), own, other), 0.0)
+        return length, length / min(own, other)
+
+    volume = min(math.prod(common(axis)[0] for axis in turn.T) for _, turn, _ in (a, b))
+    if volume == 0.0:
+        return 0.0
+    on_edges = min(common(axis)[1] for _, turn, _ in (a, b) for axis in turn.T)
+    normals = [np.cross(axis, other) for axis in a[1].T for other in b[1].T]
+    on_normals = min(common(normal)[1] for normal in normals if normal @ normal > 1e-4)
+    return min(on_normals / on_edges, 1.0) * volume / (8.0 * a[2].prod())
+
+
+def body_corrections(cells, bodies, window, close, overlap_demagnetization: float, full_overlap: float) -> np.ndarray:
     """Tensors between cells of different bodies [1/m³], shape [n, 3, n, 3]: H_i is the sum of T_ij m_j.
 
     Args:
@@ -92,15 +120,15 @@ def body_corrections(cells, bodies, window, close, overlap_demagnetization: floa
         bodies: Body of each cell, shape [n].
         window, close: As for :func:`pair_correction`.
         overlap_demagnetization: Demagnetizing factor added to a cell inside another body.
-        full_depth: Depth from which a cell gets all of it.
+        full_overlap: Share of its volume from which a cell gets all of it.
     """
-    n, tensors, depth = len(cells), np.zeros((len(cells), 3, len(cells), 3)), np.zeros(len(cells))
+    n, tensors, overlap = len(cells), np.zeros((len(cells), 3, len(cells), 3)), np.zeros(len(cells))
     for i, j in itertools.combinations(range(n), 2):
         if bodies[i] != bodies[j]:
             tensors[i, :, j] = tensors[j, :, i] = pair_correction(cells[i], cells[j], window, close)
-            inscribed = cells[i][2].min() + cells[j][2].min()
-            depth[[i, j]] += max(1.0 - np.linalg.norm(cells[i][0] - cells[j][0]) / inscribed, 0.0)
+            overlap[i] += overlap_share(cells[i], cells[j])
+            overlap[j] += overlap_share(cells[j], cells[i])
     volumes = np.array([8.0 * half.prod() for _, _, half in cells])
-    overlap_factor = overlap_demagnetization * np.minimum(depth / full_depth, 1.0) / volumes
+    overlap_factor = overlap_demagnetization * np.minimum(overlap / full_overlap, 1.0) / volumes
     tensors[np.arange(n), :, np.arange(n)] -= overlap_factor[:, None, None] * np.eye(3)
     return tensors

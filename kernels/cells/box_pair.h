@@ -322,14 +322,6 @@ CUDA_CALLABLE inline PairMatrices pair_matrices(const BoxPair& p) {
     return result;
 }
 
-// Share of a cell's depth that it lies inside a box of another body: 0 for disjoint boxes, at most 1. Disjoint boxes
-// have disjoint inscribed spheres.
-CUDA_CALLABLE inline Number overlap_depth(const Boxes& own, const Boxes& other, Vector apart) {
-    auto inscribed = [](const Boxes& b) { return b.ball ? b.radius : smaller(b.half.x, smaller(b.half.y, b.half.z)); };
-    const Number zero = own.size * Real(0), reach = inscribed(own) + inscribed(other);
-    return larger(1 - length(apart) / reach, zero);
-}
-
 // Force on a cell, torque about its center, and the negative energy that they are derivatives of.
 struct Wrench {
     Vector force, torque;

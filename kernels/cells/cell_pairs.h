@@ -6,11 +6,11 @@
 // computed again when the relative pose of their bodies has changed.
 //
 // From Python: OVERLAP_DEMAGNETIZATION, the demagnetizing factor added to a cell inside another body, and
-// FULL_OVERLAP_DEPTH, the depth from which it gets all of it; MARGIN, by how many radii a cell may move before
+// FULL_OVERLAP, the share of its volume from which it gets all of it; MARGIN, by how many radii a cell may move before
 // candidates are searched again; MU0; and the constants of ``box_pair.h``.
 // ``CellPairs`` is the struct of cell_pairs.py.
 #pragma once
-#include "cells/box_pair.h"
+#include "cells/box_overlap.h"
 #include "shared/group.h"
 #include "shared/team.h"
 
@@ -209,14 +209,14 @@ template <class Pairs> CUDA_CALLABLE inline void tabulate(const Pairs& a, int ro
     if (slots == 0) return;
     const Boxes box = reader.boxes(own);
     const Vector x = reader.position(own);
-    Number depth = box.size * Real(0);
+    Number overlap = box.size * Real(0);
     for (int slot = share(); slot < slots; slot += SHARES) {
         const Cells other = reader.candidates(own, counts, slot);
         const Boxes other_box = reader.boxes(other);
         const Vector apart = reader.position(other) - x;
         const Mask listed = mask_of(indices(own.at) != indices(other.at));
-        depth += listed ? overlap_depth(box, other_box, apart) : depth * Real(0);
         const RelativePose pose = relative_pose(apart, box, other_box);
+        overlap += listed ? overlap_share(box, other_box, pose) : overlap * Real(0);
         const Mask moved = store_pose(slot_at(a.pose.data, reader.capacity, POSE_ROWS, slot, row), pose, box.size);
         if (!any(moved)) continue;
         const BoxPair pair = box_pair(box, other_box, pose, listed, precedes(own, other));
@@ -232,8 +232,8 @@ template <class Pairs> CUDA_CALLABLE inline void tabulate(const Pairs& a, int ro
         put_moved(detail + 9 * CHUNK, matrices.at_differences, 9, factor, moved, near);
         put_moved(detail + 18 * CHUNK, matrices.differences, 9, factor, moved, near);
     }
-    depth = smaller(group_sum(depth) / FULL_OVERLAP_DEPTH, depth * Real(0) + 1);
-    if (share() == 0) put(a.overlap_factor.data + row, OVERLAP_DEMAGNETIZATION * depth / box.volume);
+    overlap = smaller(group_sum(overlap) / FULL_OVERLAP, overlap * Real(0) + 1);
+    if (share() == 0) put(a.overlap_factor.data + row, OVERLAP_DEMAGNETIZATION * overlap / box.volume);
 }
 
 // Adds vectors times ``scale`` to an array of vectors, for cells with candidates.

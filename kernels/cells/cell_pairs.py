@@ -34,9 +34,9 @@ CLOSE = 1.75, 2.25
 of their longest sides the operator of a stack of five sheets would have an eigenvalue of -0.0025."""
 OVERLAP_DEMAGNETIZATION = 0.45
 """Demagnetizing factor added to a cell inside another body. Quadrature over intersecting boxes leaves eigenvalues of
--0.05."""
-FULL_OVERLAP_DEPTH = 0.5
-"""Depth inside other bodies from which a cell gets all of it, over the sum of the inscribed radii."""
+-0.13."""
+FULL_OVERLAP = 0.5
+"""Share of a cell's volume inside other bodies from which it gets all of it."""
 _LONGEST_LIST = 2048
 """Longest list of candidates. A face cell of a cube has 50 to 60, one in a stack of five sheets up to 500."""
 _LONGEST_CLOSE = 192
@@ -114,7 +114,7 @@ def pair_constants() -> dict[str, float]:
     """Return the constants of ``cell_pairs.h`` by name."""
     return dict(
         OVERLAP_DEMAGNETIZATION=OVERLAP_DEMAGNETIZATION,
-        FULL_OVERLAP_DEPTH=FULL_OVERLAP_DEPTH,
+        FULL_OVERLAP=FULL_OVERLAP,
         CLOSE_BEGIN=CLOSE[0],
         CLOSE_END=CLOSE[1],
         WINDOW_BEGIN=WINDOW[0],
