@@ -89,5 +89,5 @@ def pair_corrections(bodies, couplings, poses):
         for x, half in zip(body.positions, coupling.half_sides, strict=True)
     ]
     labels = np.repeat(np.arange(len(bodies)), [len(body.volumes) for body in bodies])
-    overlap = cell_pairs.OVERLAP_DEMAGNETIZATION, cell_pairs.FULL_OVERLAP
+    overlap = cell_pairs.OVERLAP_DEMAGNETIZATION, cell_pairs.OVERLAP
     return boxes.body_corrections(cells, labels, cell_pairs.WINDOW, cell_pairs.CLOSE, *overlap)

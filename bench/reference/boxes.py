@@ -112,7 +112,7 @@ def overlap_share(a, b) -> float:
     return min(on_normals / on_edges, 1.0) * volume / (8.0 * a[2].prod())
 
 
-def body_corrections(cells, bodies, window, close, overlap_demagnetization: float, full_overlap: float) -> np.ndarray:
+def body_corrections(cells, bodies, window, close, overlap_demagnetization: float, overlaps) -> np.ndarray:
     """Tensors between cells of different bodies [1/m³], shape [n, 3, n, 3]: H_i is the sum of T_ij m_j.
 
     Args:
@@ -120,7 +120,7 @@ def body_corrections(cells, bodies, window, close, overlap_demagnetization: floa
         bodies: Body of each cell, shape [n].
         window, close: As for :func:`pair_correction`.
         overlap_demagnetization: Demagnetizing factor added to a cell inside another body.
-        full_overlap: Share of its volume from which a cell gets all of it.
+        overlaps: Shares of its volume from which a cell gets some and all of it.
     """
     n, tensors, overlap = len(cells), np.zeros((len(cells), 3, len(cells), 3)), np.zeros(len(cells))
     for i, j in itertools.combinations(range(n), 2):
@@ -129,6 +129,6 @@ def body_corrections(cells, bodies, window, close, overlap_demagnetization: floa
             overlap[i] += overlap_share(cells[i], cells[j])
             overlap[j] += overlap_share(cells[j], cells[i])
     volumes = np.array([8.0 * half.prod() for _, _, half in cells])
-    overlap_factor = overlap_demagnetization * np.minimum(overlap / full_overlap, 1.0) / volumes
+    overlap_factor = overlap_demagnetization * np.interp(overlap, overlaps, (0.0, 1.0)) / volumes
     tensors[np.arange(n), :, np.arange(n)] -= overlap_factor[:, None, None] * np.eye(3)
     return tensors

@@ -5,9 +5,9 @@
 // Rows are in the frame of box i and columns in that of box j: a box's axes are the axes of its body's grid. They are
 // computed again when the relative pose of their bodies has changed.
 //
-// From Python: OVERLAP_DEMAGNETIZATION, the demagnetizing factor added to a cell inside another body, and
-// FULL_OVERLAP, the share of its volume from which it gets all of it; MARGIN, by how many radii a cell may move before
-// candidates are searched again; MU0; and the constants of ``box_pair.h``.
+// From Python: OVERLAP_DEMAGNETIZATION, the demagnetizing factor added to a cell inside another body, OVERLAP_BEGIN and
+// OVERLAP_END, the shares of its volume from which it gets some and all of it; MARGIN, by how many radii a cell may
+// move before candidates are searched again; MU0; and the constants of ``box_pair.h``.
 // ``CellPairs`` is the struct of cell_pairs.py.
 #pragma once
 #include "cells/box_overlap.h"
@@ -232,7 +232,9 @@ template <class Pairs> CUDA_CALLABLE inline void tabulate(const Pairs& a, int ro
         put_moved(detail + 9 * CHUNK, matrices.at_differences, 9, factor, moved, near);
         put_moved(detail + 18 * CHUNK, matrices.differences, 9, factor, moved, near);
     }
-    overlap = smaller(group_sum(overlap) / FULL_OVERLAP, overlap * Real(0) + 1);
+    const Number zero = overlap * Real(0),
+                 within = (group_sum(overlap) - OVERLAP_BEGIN) / (OVERLAP_END - OVERLAP_BEGIN);
+    overlap = smaller(larger(within, zero), zero + 1);
     if (share() == 0) put(a.overlap_factor.data + row, OVERLAP_DEMAGNETIZATION * overlap / box.volume);
 }
 

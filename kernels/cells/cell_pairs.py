@@ -35,8 +35,8 @@ of their longest sides the operator of a stack of five sheets would have an eige
 OVERLAP_DEMAGNETIZATION = 0.45
 """Demagnetizing factor added to a cell inside another body. Quadrature over intersecting boxes leaves eigenvalues of
 -0.13."""
-FULL_OVERLAP = 0.5
-"""Share of a cell's volume inside other bodies from which it gets all of it."""
+OVERLAP = 0.02, 0.5
+"""Shares of a cell's volume inside other bodies from which it gets some and all of it. Contacts share less."""
 _LONGEST_LIST = 2048
 """Longest list of candidates. A face cell of a cube has 50 to 60, one in a stack of five sheets up to 500."""
 _LONGEST_CLOSE = 192
@@ -114,7 +114,8 @@ def pair_constants() -> dict[str, float]:
     """Return the constants of ``cell_pairs.h`` by name."""
     return dict(
         OVERLAP_DEMAGNETIZATION=OVERLAP_DEMAGNETIZATION,
-        FULL_OVERLAP=FULL_OVERLAP,
+        OVERLAP_BEGIN=OVERLAP[0],
+        OVERLAP_END=OVERLAP[1],
         CLOSE_BEGIN=CLOSE[0],
         CLOSE_END=CLOSE[1],
         WINDOW_BEGIN=WINDOW[0],

@@ -21,6 +21,8 @@ TIMES = (0.0, 1.0, 10.0, -1.0, 1e9, 1e12, 1e300, math.inf, math.nan, 1e-9)
 RATIOS = (1e-6, 1e-4, 1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3, 1e4, 1e6)
 DISTANCES = (0.02, 0.1, 0.15, 0.5, 10.0, 1e5)
 """Distances of plates [m]: those of 60 mm act by few moments from about 0.1 m on."""
+THICKNESSES = (0.02, 0.003, 0.001, 0.0003, 0.0001)
+"""Thicknesses of plates and sheets [m]."""
 SIZES = (0.0, -1.0, 1e-30, 1e-12, 1e-3, 1.0, 1e12, 1e30, math.inf, math.nan)
 """Numbers of circuits in their units."""
 SCHEMAS = (
@@ -168,25 +170,47 @@ def slender(layer, prims, chance) -> str:
     return f"{prim.path} stretched by {first}, {second}"
 
 
-def plate(layer, prims, chance) -> str:
-    """Add a plate of iron, far from everything, where it acts by few moments, or not."""
-    if layer.GetPrimAtPath("/Plate"):  # two at one place need hundreds of evaluations of the field in each substep
+def plates(layer, prims, chance) -> str:
+    """Add a plate of iron, near or far, where it acts by few moments, and sheets in, on and across it."""
+    if layer.GetPrimAtPath("/Plate"):
         return "nothing"
-    distance, prim = chance.choice(DISTANCES), _define(layer, "/Plate", "Cube")
+    distance, thickness = chance.choice(DISTANCES), chance.choice(THICKNESSES)
+    _add_plate(layer, "/Plate", (0.06, 0.06, thickness), (0.0, 0.0, distance), (0.0, 0.0, 0.0), chance)
+    places = chance.choices(("inside", "same", "on", "across", "turned"), k=chance.choice((0, 0, 1, 1, 2, 3)))
+    for number, place in enumerate(places):
+        sheet, side = chance.choice(THICKNESSES), chance.choice((0.06, 0.06, 0.02))
+        offset, turn = [chance.uniform(-0.2, 0.2) * side, chance.uniform(-0.2, 0.2) * side, 0.0], (0.0, 0.0, 0.0)
+        if place == "same":
+            offset = [0.0, 0.0, 0.0]
+        elif place == "on":
+            offset[2] = 0.5 * (thickness + sheet) * chance.choice((1.0, 0.999, 0.9, 1.01))
+        elif place != "inside":
+            turn = (chance.uniform(-90.0, 90.0) if place == "across" else 0.0, 0.0, chance.uniform(-90.0, 90.0))
+        center = (offset[0], offset[1], distance + offset[2])
+        prim = _add_plate(layer, f"/Sheet{number}", (side, side, sheet), center, turn, chance)
+        if number:  # a second sheet of automatic cells would have more than two thousand with the others
+            _attribute(prim, "warpmag:momentSpacing", "float").default = chance.choice((0.003, 0.006, 0.02))
+    return f"a plate at {distance}, sheets {places}"
+
+
+def _add_plate(layer, path, sides, center, turn, chance) -> Sdf.PrimSpec:
+    """Add a plate of iron of sides [m] at a center [m], turned by angles [deg]."""
+    prim = _define(layer, path, "Cube")
     apis = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "WarpmagMagnetAPI"]
     prim.SetInfo("apiSchemas", Sdf.TokenListOp.CreateExplicit(apis))
     values = {
         "size": ("double", 1.0),
-        "xformOp:translate": ("double3", Gf.Vec3d(0.0, 0.0, distance)),
-        "xformOp:scale": ("double3", Gf.Vec3d(0.06, 0.06, chance.choice((0.003, 0.02, 1e-4)))),
-        "xformOpOrder": ("token[]", Vt.TokenArray(["xformOp:translate", "xformOp:scale"])),
+        "xformOp:translate": ("double3", Gf.Vec3d(*center)),
+        "xformOp:rotateXYZ": ("float3", Gf.Vec3f(*turn)),
+        "xformOp:scale": ("double3", Gf.Vec3d(*sides)),
+        "xformOpOrder": ("token[]", Vt.TokenArray(["xformOp:translate", "xformOp:rotateXYZ", "xformOp:scale"])),
         "warpmag:material": ("token", "iron"),
     }
     if chance.random() < 0.3:
         values["warpmag:conductivity"] = "float", 1e6
     for name, (kind, value) in values.items():
         _attribute(prim, name, kind).default = value
-    return f"a plate at {distance}"
+    return prim
 
 
 def circuit(layer, prims, chance) -> str:
@@ -260,7 +284,7 @@ def long_transform(layer, prims, chance) -> str:
 
 HOSTILE: tuple[Callable, ...] = (
     *(texture, texture, texture, clips, clips, slender, slender, schemas, connections, connections, long_transform),
-    *(plate, plate, circuit, circuit),
+    *(plates, plates, circuit, circuit),
 )
 
 
