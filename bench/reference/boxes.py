@@ -108,7 +108,7 @@ def overlap_share(a, b) -> float:
         return 0.0
     on_edges = min(common(axis)[1] for _, turn, _ in (a, b) for axis in turn.T)
     normals = [np.cross(axis, other) for axis in a[1].T for other in b[1].T]
-    on_normals = min(common(normal)[1] for normal in normals if normal @ normal > 1e-4)
+    on_normals = min((common(normal)[1] for normal in normals if normal @ normal > 1e-4), default=1.0)
     return min(on_normals / on_edges, 1.0) * volume / (8.0 * a[2].prod())
 
 
