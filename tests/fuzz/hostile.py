@@ -175,7 +175,9 @@ def plates(layer, prims, chance) -> str:
     if layer.GetPrimAtPath("/Plate"):
         return "nothing"
     distance, thickness = chance.choice(DISTANCES), chance.choice(THICKNESSES)
-    _add_plate(layer, "/Plate", (0.06, 0.06, thickness), (0.0, 0.0, distance), (0.0, 0.0, 0.0), chance)
+    plate = _add_plate(layer, "/Plate", (0.06, 0.06, thickness), (0.0, 0.0, distance), (0.0, 0.0, 0.0))
+    if chance.random() < 0.1:  # cells cannot conduct
+        _attribute(plate, "warpmag:conductivity", "float").default = 1e6
     places = chance.choices(("inside", "same", "on", "across", "turned"), k=chance.choice((0, 0, 1, 1, 2, 3)))
     for number, place in enumerate(places):
         sheet, side = chance.choice(THICKNESSES), chance.choice((0.06, 0.06, 0.02))
@@ -187,13 +189,13 @@ def plates(layer, prims, chance) -> str:
         elif place != "inside":
             turn = (chance.uniform(-90.0, 90.0) if place == "across" else 0.0, 0.0, chance.uniform(-90.0, 90.0))
         center = (offset[0], offset[1], distance + offset[2])
-        prim = _add_plate(layer, f"/Sheet{number}", (side, side, sheet), center, turn, chance)
+        prim = _add_plate(layer, f"/Sheet{number}", (side, side, sheet), center, turn)
         if number:  # a second sheet of automatic cells would have more than two thousand with the others
             _attribute(prim, "warpmag:momentSpacing", "float").default = chance.choice((0.003, 0.006, 0.02))
     return f"a plate at {distance}, sheets {places}"
 
 
-def _add_plate(layer, path, sides, center, turn, chance) -> Sdf.PrimSpec:
+def _add_plate(layer, path, sides, center, turn) -> Sdf.PrimSpec:
     """Add a plate of iron of sides [m] at a center [m], turned by angles [deg]."""
     prim = _define(layer, path, "Cube")
     apis = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "WarpmagMagnetAPI"]
@@ -206,8 +208,6 @@ def _add_plate(layer, path, sides, center, turn, chance) -> Sdf.PrimSpec:
         "xformOpOrder": ("token[]", Vt.TokenArray(["xformOp:translate", "xformOp:rotateXYZ", "xformOp:scale"])),
         "warpmag:material": ("token", "iron"),
     }
-    if chance.random() < 0.3:
-        values["warpmag:conductivity"] = "float", 1e6
     for name, (kind, value) in values.items():
         _attribute(prim, name, kind).default = value
     return prim
