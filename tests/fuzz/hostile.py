@@ -191,7 +191,7 @@ def plates(layer, prims, chance) -> str:
         center = (offset[0], offset[1], distance + offset[2])
         prim = _add_plate(layer, f"/Sheet{number}", (side, side, sheet), center, turn)
         if number:  # a second sheet of automatic cells would have more than two thousand with the others
-            _attribute(prim, "warpmag:momentSpacing", "float").default = chance.choice((0.003, 0.006, 0.02))
+            _attribute(prim, "warpmag:momentSpacing", "float").default = chance.choice((0.006, 0.02))
     return f"a plate at {distance}, sheets {places}"
 
 
