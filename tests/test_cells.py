@@ -313,6 +313,45 @@ def test_operator_of_bodies_that_intersect_is_positive(solid, spacing, device):
         assert system.evaluations.numpy()[0] < 120
 
 
+def test_small_bodies_are_solved_as_a_whole(device):
+    """A turned bar of 16 cells, alone: the residuals of all steps are parallel, so that mixing two of them ends it."""
+    solid = lattice.box([0.01, 0.0025, 0.00125])
+    body = lattice.fill(solid, 0.0025, together=True)
+    turn = Rotation.from_rotvec([0.3, -0.5, 1.0])
+    system, operator = intersecting(body, coupled(body, [solid]), np.zeros((1, 3)), [turn], device)
+    system.solve()
+    root = np.repeat(np.sqrt(body.volumes), 3)
+    expected = root * np.linalg.solve(operator, root * np.tile([0.0, 0.0, 1e3], len(body.volumes)))
+    moments = system.moments.numpy().reshape(-1)
+    assert system.evaluations.numpy()[0] <= 4
+    assert np.linalg.norm(moments - expected) < 2e-3 * np.linalg.norm(expected)  # rtol, and the saturation of FAINT
+
+
+def test_permanent_ball_around_iron_adds_no_demagnetization(device):
+    """Iron inside a spread moment responds to other fields as without it."""
+    body = lattice.fill(lattice.box([0.005] * 3), 0.0025)
+    n, fields = len(body.volumes), []
+    coupling = demagnetization.coupling(body, body.radii)
+    moments = np.random.default_rng(2).normal(size=(2 * n, 3))
+    for radius, moment in ((1e-5, 0.0), (0.03, 5.0)):
+        system = moment_system(
+            radii=[*np.tile(body.radii, 2), radius], bodies=[*np.repeat([0, 1], n), 2],
+            permanent=np.arange(2 * n + 1) == 2 * n, couplings=[(0, coupling), (n, coupling)], saturation=1.7e6,
+            dtype="float64", device=device,
+        )  # fmt: skip
+        beside = body.positions + np.array([0.0105, 0.0, 0.0])
+        system.positions.assign(np.concatenate([body.positions, beside, [[0.004, 0.003, 0.0]]]))
+        for own in (moments, 0.0 * moments):
+            system.moments.assign(np.concatenate([own, [[0.0, 0.0, moment]]]))
+            system.begin()
+            system.moments.assign(np.concatenate([own, [[0.0, 0.0, moment]]]))  # the start has changed them
+            system._packed.pack(system.positions, system.moments)
+            system.evaluate()
+            fields.append(system.h.numpy()[: 2 * n].copy())
+    # positions are rounded to float32, and the field of the spread moment is 1e3 times that of the iron
+    np.testing.assert_allclose(fields[2] - fields[3], fields[0] - fields[1], atol=1e-6 * np.abs(fields[2]).max())
+
+
 def coenergy(system):
     """μ0/2 Σ m·H0 of inducible moments that do not saturate, for an applied field H0 [J]."""
     system.solve()

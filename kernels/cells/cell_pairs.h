@@ -145,6 +145,11 @@ template <class Pairs> struct PairReader {
         b.size = gather(a.half.data + 3 * cells, c.at);
         return b;
     }
+    CUDA_CALLABLE Mask is_inducible(const Cells& c) const {
+        int values[WIDTH], none[WIDTH] = {};
+        for (int l = 0; l < WIDTH; ++l) values[l] = a.inducible.data[c.at[l]];
+        return mask_of(indices(none) < indices(values));
+    }
     // Own cells of rows from ``row`` on, and the number of candidates of each, 0 beyond the last row.
     CUDA_CALLABLE Cells own(int row, int* counts) const {
         const int rows = *a.rows.data;
@@ -216,7 +221,8 @@ template <class Pairs> CUDA_CALLABLE inline void tabulate(const Pairs& a, int ro
         const Vector apart = reader.position(other) - x;
         const Mask listed = mask_of(indices(own.at) != indices(other.at));
         const RelativePose pose = relative_pose(apart, box, other_box);
-        overlap += listed ? overlap_share(box, other_box, pose) : overlap * Real(0);
+        const Mask induced = listed && reader.is_inducible(other);
+        overlap += induced ? overlap_share(box, other_box, pose) : overlap * Real(0);
         const Mask moved = store_pose(slot_at(a.pose.data, reader.capacity, POSE_ROWS, slot, row), pose, box.size);
         if (!any(moved)) continue;
         const BoxPair pair = box_pair(box, other_box, pose, listed, precedes(own, other));

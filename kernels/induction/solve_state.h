@@ -16,6 +16,7 @@ template <class State> CUDA_CALLABLE inline void begin_world(State& state, int w
     world.evaluations = world.has_change = world.plain_steps = 0;
     world.next = world.active && state.warm.data[w] == STEADY ? STEP_AND_SWEEP : NOTHING;
     world.best = -1.0;
+    if (world.active && world.apart > 0) world.apart -= 1;
     if (state.warm.data[w] == 0) world.change_count = 0, world.slowness = 0.0;
 }
 

@@ -35,6 +35,7 @@ class World:
     used: int  # number of changes that the next step mixes
     is_best: int  # 1 if the last iterate is the best so far
     plain_steps: int  # steps left without mixing
+    apart: int  # solves left without steps of bodies as a whole (``body_steps``), since a step was rejected
     ahead: wp.float64  # factor β of the last change from solve to solve in the next start
     best: wp.float64  # smallest merit of this solve, negative before the first evaluation
     alpha: wp.types.vector(DEPTH, wp.float64)  # Anderson coefficients
@@ -62,7 +63,7 @@ def state_type(dtype):
         slope: wp.array[dtype]
         curve: wp.array[int]
         common_curve: int
-        within_bodies: int  # 1 if moments of one body are neighbors and overlap, 0 if they act by tensors alone
+        within_body: wp.array[dtype]  # 1 where moments of a body are neighbors as balls, 0 in others, shape [n]
         curve_tables: wp.array2d[dtype]
         rtol: wp.float64  # error at which a world ends
         max_evaluations: int  # field evaluations after which a world ends unconverged
@@ -140,6 +141,7 @@ def allocate(worlds, inducible, dtype, device):
         **zeros("past_field past_g", (2, n), vec3),
         **zeros("past now swept", (count * size if on_cpu else len(rows), LINE), dtype),
         **zeros("step", n, dtype),
+        "within_body": wp.ones(n, dtype=dtype, device=device),
         **zeros("sums", (count * vectors, COLUMNS), wp.float64),
         **zeros("worlds", world_count, World),
         **zeros("residual error", world_count, wp.float64),
@@ -149,7 +151,6 @@ def allocate(worlds, inducible, dtype, device):
     state = state_type(dtype)()
     for name, array in arrays.items():
         setattr(state, name, array)
-    state.within_bodies = 1
     largest = np.max(last - first, initial=0)
     state.block_moments = size if on_cpu else next(n for n in _CHUNK_SIZES if n >= largest)
     return state

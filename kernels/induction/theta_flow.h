@@ -2,7 +2,7 @@
 // theta_flow.py has its equations; theta_step.h chooses the next step of a world.
 //
 // On a CPU a pass works on a vector of moments of one world; on a GPU a group of threads works on one moment. Takes
-// CAPACITY, DEPTH, GROUP and INVERSE_4PI from Python. ``State`` is the struct of solve_state.py.
+// CAPACITY, DEPTH, FLOW_STEP, GROUP and INVERSE_4PI from Python. ``State`` is the struct of solve_state.py.
 #pragma once
 #include "induction/theta_step.h"
 #include "material/curves.h"
@@ -95,10 +95,11 @@ template <class State> CUDA_CALLABLE inline void store_moments(State& state, con
     put_first(entries(state.packed, at, 6), at.count, m.z);
 }
 
-// True if moments i and j act on each other as balls in sweeps: few moments in place of a body do not.
+// True if moments i and j act on each other as balls in sweeps. Those of some bodies do not: few moments in place of a
+// body, and bodies with steps of their own.
 template <class State> CUDA_CALLABLE inline bool are_balls(const State& state, int i, int j) {
     const Real* const labels = (const Real*)((const char*)state.packed.data + 7 * (size_t)state.packed.strides[0]);
-    return state.within_bodies || labels[i] != labels[j];
+    return labels[i] != labels[j] || state.within_body.data[i] > 0;
 }
 
 // Calls visit(rows, mask) for the inducible neighbors of moments. A moment whose list overflowed has no neighbors.
@@ -154,9 +155,10 @@ template <class State> CUDA_CALLABLE inline Number step_of(const State& state, c
 // any arrangement, and are short only where balls overlap.
 template <class State> CUDA_CALLABLE inline Number total_overlap(const State& state, const Span& at) {
     const Real* const labels = entries(state.packed, at, 7) - at.i;
-    const bool within = state.within_bodies;
+    const Real* const within = (const Real*)state.within_body.data;
     auto others = [=](Index i, Index j) {
-        return within ? mask_of(j != i) : mask_of(collect(labels, i) != collect(labels, j));
+        const Mask same = mask_of(collect(labels, i) == collect(labels, j));
+        return !same || (mask_of(collect(within, i) > Real(0)) && mask_of(j != i));
     };
     return shared_volumes(state, at.i, at.count, at.begin, at.end, others);
 }

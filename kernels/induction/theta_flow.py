@@ -59,6 +59,8 @@ from warpmag.kernels.shared.reductions import group_threads, most_blocks
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, launch_passes, threads_for
 
 START, FIRST_SWEEP, LAST_SWEEP, MEASURE, CHOOSE, ADVANCE = range(6)  # passes in order; as in ``theta_flow.h``
+FLOW_STEP = 0.9
+"""Step length over the largest convergent one."""
 _START_THREADS = 256
 """Most threads of a GPU's block at the start of a solve, where a moment takes a group of threads."""
 _RESIDENT_BLOCKS = {wp.float32: (3, 5), wp.float64: (2, 3)}
@@ -66,7 +68,7 @@ _RESIDENT_BLOCKS = {wp.float32: (3, 5), wp.float64: (2, 3)}
 
 
 def _constants(group: int) -> dict:
-    constants = {"GROUP": group, "CAPACITY": CAPACITY, "DEPTH": DEPTH}
+    constants = {"GROUP": group, "CAPACITY": CAPACITY, "DEPTH": DEPTH, "FLOW_STEP": FLOW_STEP}
     return constants | {"INVERSE_4PI": INVERSE_4PI}
 
 

@@ -6,7 +6,7 @@
 namespace warpmag {
 
 constexpr int PLAIN_STEPS = DEPTH + 1; // plain steps after an accelerated step was rejected
-constexpr double FLOW_STEP = 0.9;      // fraction of the largest convergent step length
+constexpr int APART = 32;              // solves without steps of bodies as a whole after a step was rejected
 constexpr double WHOLE_STEP = 0.6;     // step length of balls without overlap
 constexpr double SLOWEST = 20.0;       // largest error amplification by slow convergence
 constexpr double LEAST = 0.01;         // lower bound of an error, as a fraction of the last change
@@ -64,6 +64,7 @@ CUDA_CALLABLE inline bool mix(World& world, const History& history, const double
     // Plain steps descend in energy even where the merit grows, so only accelerated steps are checked.
     if (!finite || (!first && world.plain_steps == 0 && merit > 2.0 * world.best)) {
         world.plain_steps = PLAIN_STEPS;
+        world.apart = APART;
         return false;
     }
     if (world.plain_steps > 0) world.plain_steps -= 1;

@@ -29,6 +29,7 @@ from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.pairs.work_list import pair_count
 from warpmag.kernels.pairs.wrench import MU0, launch_zeeman_moments
 from warpmag.moments.arrays import host_array, resolve_device, resolve_dtype, shape_message, vec3_type
+from warpmag.moments.body_steps import make_body_steps
 from warpmag.moments.dynamics import make_dynamics
 from warpmag.moments.fmm import SystemSums, fast_sums_for
 from warpmag.moments.layout import MomentLayout, MomentMaterial, change_material, make_layout, with_cells
@@ -103,7 +104,8 @@ class MomentSystem:
         error: Relative error of each world's magnetization, estimated by ``theta`` (see ``kernels.induction``); other
             dynamics give the residual; shape [worlds].
         residual: Relative residual ‖M − f(H)‖/‖f(H)‖ of each world at its last field evaluation, the computable form of
-            Eq. 12, shape [worlds]; ``theta`` takes one more step after it.
+            Eq. 12, shape [worlds]; ``theta`` takes one more step after it. Bodies that take steps as a whole
+            (``kernels.induction.body_steps``) have the deviation from such a step in it.
         evaluations: Field evaluations of the last solve, shape [worlds].
         converged: 1 where the last solve reached ``rtol``, shape [worlds].
     """
@@ -145,13 +147,14 @@ class MomentSystem:
         self._fast = fast_sums_for(settings.method, self._packed, layout, body_extent, float(settings.rtol))
         self.is_fast, self.fmm_rtol = isinstance(self._fast, SystemSums), self._fast.rtol
         self._make_field(layout, near)
-        self._make_cells(layout, couplings, {solid.first for solid in solids})
+        in_worlds = self._make_cells(layout, couplings, {solid.first for solid in solids})
         if self._cells is not None and solids:
             self._include_cells(couplings, {solid.first for solid in solids})
         self._make_wrench(layout, rotatable)
         self._near = self._make_near_contacts(layout, rotatable, susceptibility, faces) if near else None
         limits = float(settings.rtol), int(settings.max_evaluations)
         solve_state.bind(self._induction, self._packed, self.material, self.moments, *limits)
+        self._body_steps = make_body_steps(in_worlds, self.worlds, self.rotations, self._induction, settings.dynamics)
         self.dynamics = make_dynamics(settings.dynamics, self._induction, step=settings.step, damping=settings.damping)
 
     def _allocate(self, layout: MomentLayout, external_field):
@@ -210,13 +213,12 @@ class MomentSystem:
         self._inducible_field = PairEvaluation(Quantity.FIELD, of_inducible, packed, packed, state.h0, self.h, **more)
 
     def _make_cells(self, layout: MomentLayout, couplings, closed_forms: set[int]):
-        """Prepare the corrections between cells.
+        """Prepare the corrections between cells. Return the couplings of bodies among the others of their worlds.
 
         ``closed_forms`` are the first moments of bodies whose near field has a closed form, in place of corrections.
         """
         self._couplings, self._cells, self._cell_pairs, self.rotations, self.crowded = (), None, None, None, None
         if couplings:
-            self._induction.within_bodies = int(all(coupling.near for _, coupling in couplings))
             takes_part = [coupling.near and first not in closed_forms for first, coupling in couplings]
             in_world = np.bincount(layout.worlds[[first for first, _ in couplings]], minlength=layout.worlds.max() + 1)
             couplings = [(first, coupling.among(in_world[layout.worlds[first]])) for first, coupling in couplings]
@@ -231,6 +233,7 @@ class MomentSystem:
                     self.torques,
                 )  # fmt: skip
                 self.crowded = self._cell_pairs.crowded
+        return couplings
 
     def _include_cells(self, couplings, closed_forms: set[int]):
         """Let permanent bodies act on the cells near them by averages; ``closed_forms`` as in :meth:`_make_cells`."""
@@ -425,6 +428,8 @@ class MomentSystem:
         self._add_cell_pairs()
         if self._cells is not None:
             self._cells.launch()
+        if self._body_steps is not None:
+            self._body_steps.launch()
         self.dynamics.iterate()
         self._wait_for_near_contacts()
 
