@@ -3,7 +3,7 @@
 The residual of a body's moments, r = k H/Ms − s, becomes r + w (Q − 1) r with the inverse Q of the body's own operator
 (``warpmag.shapes.body_response``). The flow then takes its usual step, and estimates the error of the body as a whole.
 Q belongs to χ = ∞ without saturation, and to bodies that do not intersect. Let d be the mean of (k/3) ‖M‖/(Ms ‖s‖) over
-the body, and e that of k o_i (``theta_flow.py``) beyond contact. Where Q divides a mode by λ, λ' = 1 − d (1 − λ) + e
+the body, and e that of 2 k o_i (``theta_flow.py``) beyond contact. Where Q divides a mode by λ, λ' = 1 − d (1 − λ) + e
 would be right. So w = (1/λ' − 1)/(1/λ − 1) with the least λ of the body, and at least 0, exceeds the factor of no mode.
 After a step that the flow rejects, w is 0 for some solves.
 
@@ -20,8 +20,8 @@ from warpmag.kernels.induction.solve_state import state_type
 from warpmag.kernels.induction.theta_flow import FLOW_STEP
 from warpmag.kernels.shared.axpy import launch_add_scaled
 
-_CONTACT = 0.1
-"""Volume over its own that a cell's ball shares with balls of bodies in contact, and up to which e is 0."""
+_CONTACT = 0.2
+"""Twice the volume over its own that a cell's ball shares with balls of bodies in contact, up to which e is 0."""
 
 
 @cache

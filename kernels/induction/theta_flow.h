@@ -188,7 +188,9 @@ template <class State> CUDA_CALLABLE inline void start(State& state, const Span&
     const Real ahead = (Real)world.ahead;
     const Four ball = balls_at(state, at);
     const Material material = material_of(state, at);
-    const Number omega = step_length<Real>(material.slope * (total_overlap(state, at) + Real(2.0 / 3.0)));
+    // Cells that act by tensors alone have the demagnetizing factor of overlaps, too, which is at most the share.
+    const Number twice = 2 - numbers_or(entries(state.within_body, at), at.count, 1);
+    const Number omega = step_length<Real>(material.slope * (twice * total_overlap(state, at) + Real(2.0 / 3.0)));
     Vector near = {0, 0, 0};
     if (warm == STEADY) near = extrapolated_field(state, at, ball, ahead);
     if (share() != 0) return;
