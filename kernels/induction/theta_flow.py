@@ -11,7 +11,8 @@ The weight φ = Ms c(a)/a, a = max(‖s‖, ‖g‖), converts a residual to mag
 moments does not dominate. The plain step is mirror descent on the energy Σ V Φ(M) − ½ M·GM − H0·M, which is convex for
 the ball-averaged kernel. Let L_i = 1 + k (2/3 + o_i), with o_i the volume that a ball shares with others
 (``total_overlap`` in ``theta_flow.h``). The energy decreases from any state for ω_i ≤ 1/L_i, and near the solution the
-steps converge for ω_i < 2/L_i. Steps are short only where balls overlap.
+steps converge for ω_i < 2/L_i. Steps are short only where balls overlap. Cells of bodies that take steps as a whole
+(``body_steps.py``) count o_i twice, because of the demagnetizing factor of overlaps.
 
 A step changes the field most at near neighbors. Sweeps update the neighbors' part without another evaluation of the
 whole field. With the coupling G' of the listed neighbors, two sweeps s ← s + ω' (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s)
