@@ -109,6 +109,20 @@ def test_two_coils_are_a_transformer(device):
     np.testing.assert_allclose(currents, expected, atol=2e-4 * np.abs(expected).max())  # second order in dt
 
 
+@pytest.mark.parametrize("share", [0.1, 0.7, None])
+def test_coupled_coils_lose_energy(share, device):
+    """Coils closer than their given inductances allow: the energy in them can only become heat."""
+    own = TURNS**2 * self_inductance(Coil(**LOOP).record())
+    builder = coil_and_ball(LOOP, inductance=(share or 0.0) * own, ampere_turns=100.0)
+    place_of_copy = wp.transform((0.0, 0.0, 0.0 if share is None else 1e-4), wp.quat_identity())
+    circuit = {"resistance": RESISTANCE, "turns": TURNS, "inductance": (share or 0.0) * own}
+    warpmag.add_coil(builder, **LOOP, **circuit, xform=place_of_copy)
+    model = builder.finalize(device=device)
+    currents = currents_over_time(warpmag.Magnetics(model), model.state(), 1e-4, 60)
+    assert np.abs(currents).max() <= 100.0 / TURNS
+    assert np.abs(currents[-1]).max() < np.abs(currents[0]).max()
+
+
 def test_a_given_current_induces_one(device):
     builder = coil_and_ball(LOOP, resistance=1e-6)  # keeps its flux
     warpmag.add_coil(builder, **SOLENOID, label="given")
@@ -251,6 +265,8 @@ def test_repeated_attempts_do_not_repeat_the_circuit(device):
     ({"resistance": -1.0}, "add_coil: resistance: must be 0 or"),
     ({"resistance": 1.0, "voltage": 12.0}, "add_coil: turns is missing: a coil with a resistance needs their number"),
     ({"resistance": 1.0, "turns": 1, "voltage": math.nan}, "add_coil: voltage: must be finite"),
+    ({"resistance": 1.0, "turns": 1e12, "inductance": 1e-3},
+     r"add_coil: inductance must be 0 or at least 1 % of the \S+ H of 1e\+12 turns of this shape, got 0.001"),
     ({"resistance": 1.0, "turns": 1, "radius": 0.0, "shape": "polyline", "points": np.eye(3), "closed": False},
      "an open polyline is only a part of a circuit"),
 ])  # fmt: skip

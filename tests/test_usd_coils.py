@@ -198,6 +198,8 @@ UNEVEN = "float3 xformOp:scale = (1, 2, 1)", 'uniform token[] xformOpOrder = ["x
     (coil(), "/Thing: radius: must be positive"),
     (coil("float warpmag:coil:radius = -1"), "/Thing: radius: must be positive"),
     (coil("float warpmag:coil:radius = 1", "float warpmag:coil:voltage = 1"), "/Thing: voltage is given, but only a"),
+    (coil("float warpmag:coil:radius = 1", "float warpmag:coil:resistance = 1", "float warpmag:coil:turns = 1e12",
+          "float warpmag:coil:inductance = 1"), "/Thing: inductance must be 0 or at least 1 % of the"),
     (coil("float warpmag:coil:radius = 1", "float warpmag:coil:voltage.timeSamples = { 0: 0, 1: 1 }"), "/Thing: "),
     (coil("float warpmag:coil:radius = 1", "float warpmag:coil:resistance = 1", "float warpmag:coil:turns = 9",
           "float warpmag:coil:ampereTurns.timeSamples = { 0: 0, 1: 1 }"), "but follows from the voltage"),

@@ -15,10 +15,14 @@ import itertools
 import numpy as np
 
 from warpmag.declarations.coils import SourceRecord
+from warpmag.errors import InputError
 
 MU0 = 4e-7 * np.pi
 _MEAN_DISTANCE = float(np.exp(-0.25))
 """Geometric mean distance within a circle with uniform current, over its radius."""
+_LEAST_SHARE = 0.01
+"""Smallest inductance that a winding may be given, over that of its geometry. The wire of a loop may be 50 times as
+thick as by default, which reduces the inductance to a fifth."""
 _HEIGHTS, _FILAMENTS, _ANGLES, _PIECES = 24, 37, 128, 48
 """Loops of a sheet for A, and for its filaments, which then avoid the loops of an equal sheet; points of a circle, and
 points of a straight piece."""
@@ -36,6 +40,20 @@ def self_inductance(record: SourceRecord) -> float:
     if record.kind == "solenoid":
         return _sheet_inductance(radius, 2.0 * record.parameters[1])
     return _flux(record, *_filaments(record), wire=wire)
+
+
+def check_inductance(name: str, record: SourceRecord) -> None:
+    """Raise :class:`InputError` naming ``name`` if the given inductance is far too small for the coil's turns.
+
+    The flux of magnets through the turns would drive currents without bounds.
+    """
+    if record.circuit is None or not record.circuit.inductance:
+        return
+    turns, _, given = record.circuit
+    usual = turns**2 * self_inductance(record)
+    if not given >= _LEAST_SHARE * usual:
+        least = f"{100.0 * _LEAST_SHARE:g} % of the {usual:.3g} H of {turns:g} turns of this shape"
+        raise InputError(f"{name}: inductance must be 0 or at least {least}, got {given:g}")
 
 
 def mutual_inductance(record: SourceRecord, other: SourceRecord, rotation: np.ndarray, offset: np.ndarray) -> float:

@@ -18,6 +18,8 @@ from warpmag.shapes.inductance import mutual_inductance, self_inductance
 
 _POSE_DIGITS = 4
 """Digits of relative poses, over the size of a coil, to which inductances of replicated worlds are shared."""
+_LEAST_ENERGY = 1e-4
+"""Smallest energy of currents through coupled coils, over that without the coupling."""
 
 
 class CoilCircuits:
@@ -76,6 +78,8 @@ class CoilCircuits:
         for row, k in enumerate(circuits):
             first, last = begin[world[row]], begin[world[row] + 1]
             table[row, : last - first] = [inductances.between(k, j) for j in circuits[first:last]]
+        for first, last in pairwise(begin):
+            table[first:last, : last - first] = _with_positive_energy(table[first:last, : last - first])
         given_of = [inductances.given(k) for k in circuits]
         given = np.full((count, max(map(len, given_of))), -1)
         given_table = np.zeros(given.shape)
@@ -109,6 +113,17 @@ class CoilCircuits:
         """Launch the return of the circuits of chosen worlds to the start, with the strengths of the model."""
         for rows in self._rows:
             rows.restore(mask)
+
+
+def _with_positive_energy(table: np.ndarray) -> np.ndarray:
+    """Return inductances of coils [H] with mutual inductances reduced by a factor if the energy could be negative.
+
+    Inductances that are given, and rounding at coils in the same place, may contradict the geometry. The currents would
+    grow without bounds.
+    """
+    sizes = np.sqrt(np.diag(table))
+    excess = max(_LEAST_ENERGY - np.linalg.eigvalsh(table / np.outer(sizes, sizes))[0], 0.0)
+    return (table + excess * np.diag(np.diag(table))) / (1.0 + excess)
 
 
 class _Inductances:

@@ -19,6 +19,7 @@ from warpmag.engine.magnets.attributes import check_registered
 from warpmag.engine.magnets.selection import selected
 from warpmag.errors import InputError
 from warpmag.moments.arrays import host_array
+from warpmag.shapes.inductance import check_inductance
 
 _UNIT_TOLERANCE = 1e-3
 """Largest deviation of a quaternion's norm from 1; components are often rounded to few digits."""
@@ -67,7 +68,8 @@ def add_coil(
             short circuit.
         turns: Number of turns; a coil with a resistance needs it.
         inductance: Inductance of a coil with a resistance, in air [H]. By default that of its geometry: all turns in
-            the wire of a loop or a polyline, or in the sheet of a solenoid.
+            the wire of a loop or a polyline, or in the sheet of a solenoid. A hundredth of that is the least. Coils of
+            a body couple less where a smaller inductance would make the energy of some currents negative.
         xform: Pose of the coil in the frame of the body, or in the world.
         label: Label of the coil, by which :meth:`warpmag.Magnetics.set_current` finds it.
 
@@ -94,6 +96,7 @@ def add_coil(
         resistance, voltage, turns, inductance,
     )  # fmt: skip
     coil.check("add_coil")
+    check_inductance("add_coil", coil.record())
     return _add_source(builder, body, coil, xform, "coil", label)
 
 

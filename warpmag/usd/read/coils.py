@@ -15,6 +15,7 @@ from warpmag.declarations.coils import Coil, FieldMap, check_strength
 from warpmag.declarations.keys import Keys
 from warpmag.declarations.schemas import COIL_SCHEMA, FIELD_MAP_SCHEMA
 from warpmag.errors import InputError
+from warpmag.shapes.inductance import check_inductance
 from warpmag.usd.read.clock import stage_clock
 from warpmag.usd.read.keys import KeyReader
 from warpmag.usd.read.prims import body_of
@@ -78,8 +79,9 @@ def sources_of(prim: Usd.Prim, transforms: TransformCheck, keys: KeyReader) -> I
         if has_api(prim, COIL_SCHEMA.name):
             coil = _coil(prim)
             coil.check(path)
-            drive = _drive(prim, coil, keys)
-            yield PlacedSource(path, _scaled(coil, scale), body, position, rotation, drive)
+            drive, coil = _drive(prim, coil, keys), _scaled(coil, scale)
+            check_inductance(path, coil.record())
+            yield PlacedSource(path, coil, body, position, rotation, drive)
         if has_api(prim, FIELD_MAP_SCHEMA.name):
             field_map = field_map_of(prim)
             if (ratio := field_map.border_ratio()) > _BORDER_WARNING:
