@@ -7,7 +7,7 @@ import os
 import signal
 
 import pytest
-from fuzz import calls
+from fuzz.calls import caller, children, functions, worlds
 
 pytestmark = pytest.mark.no_cover  # what is drawn decides no line of the report
 HEAVY = ("Simulation", "Display")
@@ -17,19 +17,21 @@ HEAVY = ("Simulation", "Display")
 @pytest.fixture(scope="module", autouse=True)
 def kernels():
     """Compiled before the first fork."""
-    for kind in calls.KINDS:
-        calls.new_world(kind=kind)
+    for kind in worlds.KINDS:
+        worlds.new_world(kind=kind)
 
 
-@pytest.mark.parametrize("owner", [*calls.OWNERS, "functions"])
+@pytest.mark.parametrize("owner", [*functions.OWNERS, "functions"])
 def test_wild_calls_are_refused_or_finite(owner, device):
     if device != "cpu":
         pytest.skip("a GPU does not survive a fork")
-    names = [name for name in calls.targets() if (name.partition(".")[0] in calls.OWNERS) == (owner != "functions")]
+    names = [
+        name for name in functions.targets() if (name.partition(".")[0] in functions.OWNERS) == (owner != "functions")
+    ]
     names = [name for name in names if owner in ("functions", name.partition(".")[0])]
-    count, step = (3, 1) if owner in HEAVY else (6, calls.OFTEN)  # else each in a world of another kind
+    count, step = (3, 1) if owner in HEAVY else (6, worlds.OFTEN)  # else each in a world of another kind
     numbers = [*range(0, count * step, step)]
-    results = [outcome for name in names for outcome in calls.outcomes(name, 7, numbers)]
+    results = [outcome for name in names for outcome in children.outcomes(name, 7, numbers)]
     assert [(outcome.number, outcome.call, outcome.problem) for outcome in results if outcome.problem] == []
     assert len(results) == count * len(names) and any(outcome.taken for outcome in results)
 
@@ -41,10 +43,10 @@ def test_a_crash_is_seen(monkeypatch):
         announce(f"call {number}")
         if number == 2:
             os.kill(os.getpid(), signal.SIGKILL)
-        return calls.Outcome(number, f"call {number}", taken=True)
+        return caller.Outcome(number, f"call {number}", taken=True)
 
-    monkeypatch.setattr(calls.Caller, "call", call)
-    results = {outcome.number: outcome for outcome in calls.outcomes("wrench", 0, list(range(4)))}
+    monkeypatch.setattr(caller.Caller, "call", call)
+    results = {outcome.number: outcome for outcome in children.outcomes("wrench", 0, list(range(4)))}
     assert sorted(results) == [0, 1, 2, 3]
     assert results[2].call == "call 2" and results[2].problem == f"its process ended with the status {signal.SIGKILL:d}"
     assert not any(results[number].problem for number in (0, 1, 3))

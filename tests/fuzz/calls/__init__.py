@@ -1,0 +1,1 @@
+"""Wild calls of every public function (``python -m tests.fuzz.calls``)."""
