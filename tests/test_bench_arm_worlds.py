@@ -23,7 +23,7 @@ def test_all_parts(tmp_path, device, monkeypatch, capsys):
         assert line["magnetics_ms"] > 0.0
         assert line["mujoco_ms"] > 0.0
         assert line["force"] > 0.0
-    # few moments of the plate are good to 1 % (docs/physics/near_bodies.md), and so is the reference far away
+    # few moments of the plate are good to 1 % (docs/physics/distant_bodies.md), and so is the reference far away
     assert gaps[0]["error"] < 0.02
     assert [line["cells"] for line in spacings] == [25, 722]
     assert spacings[1]["error"] == pytest.approx(gaps[0]["error"], abs=1e-4)

@@ -30,7 +30,7 @@ FILE = re.compile(r"^```(?:xml)?\n((?:#usda 1\.0\n# |<!-- )(\S+).*?)^```$", re.M
 COMMAND = re.compile(r"^(?:pip install uv && uv run )?(warpmag .*)$", re.MULTILINE)
 SLOW = (
     "physics.md",
-    *(f"physics/{name}.md" for name in ("equilibrium", "forces", "bodies", "near_bodies", "coils")),
+    *(f"physics/{name}.md" for name in ("equilibrium", "uniqueness", "forces", "bodies", "near_bodies", "coils")),
     *(f"howto/{name}.md" for name in ("coils", "design", "energy", "gradients", "holding")),
     *(f"howto/{name}.md" for name in ("material", "mujoco", "newton", "switch")),
     *(f"tutorials/{name}.md" for name in ("blender", "coils", "robot")),
