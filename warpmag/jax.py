@@ -77,7 +77,7 @@ class InductionArrays:
 
     Attributes:
         magnetizations: M [A/m], shape [n, 3].
-        h_field: Field H at the balls [A/m], without a ball's own, shape [n, 3].
+        h_field: Field H at the balls [A/m], without the ball's own, shape [n, 3].
     """
 
     magnetizations: Any

@@ -69,7 +69,7 @@ class InductionTensors:
 
     Attributes:
         magnetizations: M [A/m], shape [n, 3].
-        h_field: Field H at the balls [A/m], without a ball's own, shape [n, 3].
+        h_field: Field H at the balls [A/m], without the ball's own, shape [n, 3].
         error, evaluations, converged: As in :class:`warpmag.InductionResult`.
     """
 

@@ -48,7 +48,7 @@ class InductionResult:
 
     Attributes:
         magnetizations: M [A/m], shape [n, 3].
-        h_field: Field H at the balls [A/m], without a ball's own, shape [n, 3].
+        h_field: Field H at the balls [A/m], without the ball's own, shape [n, 3].
         error: Estimated relative error of the magnetizations, ‖M − M*‖/‖M*‖ over all balls, where M* is the exact
             solution. ``theta`` multiplies the last residual by its estimated amplification (see
             ``warpmag.kernels.induction.theta_flow``). For other dynamics it is the residual ‖M − f(H)‖/‖f(H)‖, the

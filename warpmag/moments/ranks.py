@@ -124,7 +124,7 @@ def sweep(simulate: Callable[[range], _R], world_count: int, *, together: int) -
     ranks: results are bitwise identical to a single process, on any device.
 
     Args:
-        simulate: Function of the numbers of the worlds of a group. Its result is sent to all ranks and must be
+        simulate: Function that takes the range of the worlds of a group. Its result is sent to all ranks and must be
             picklable, such as NumPy arrays.
         world_count: Number of worlds.
         together: Worlds of a group; the last group may have fewer. Rank r of R simulates every R-th group from the

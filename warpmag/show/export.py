@@ -33,13 +33,13 @@ def export(
     """Export a scene, or the recording of a run.
 
     Positions are those of the stage, bitwise in single precision. ``.npz`` and ``.csv`` contain the recording in SI
-    units and take no options. ``.html`` is one web page that needs no network, to orbit and play, in the colors of the
-    materials, without textures.
+    units and take no options. ``.html`` is one web page that plays the motion from any side without a network, in the
+    colors of the materials, without textures.
 
     Args:
         stage: USD file.
         output: File to write: ``.usd``, ``.usda``, ``.usdc``, ``.usdz``, ``.html``, ``.npz`` or ``.csv``.
-        fps: Frames, and time codes, per second [1/s]; Blender plays at 24, a page in real time.
+        fps: Frames and time codes per second [1/s]; Blender plays 24 per second, a page plays in real time.
         color: Quantity that colors the bodies: ``magnetization``, ``speed``, or ``force`` (the magnetic force between
             the moments of the frame); by default bodies have their materials.
         arrows: Draw moments as arrows.

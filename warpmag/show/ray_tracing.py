@@ -86,7 +86,7 @@ def render(
         size: Width and height [px].
         arrows: Draw the moments of the recording as arrows.
         camera: Prim path of a perspective camera, or ``auto`` for a view of all bodies. By default the first camera of
-            the stage, or ``auto`` if it sees no body, or nothing else than one shape, as from inside it.
+            the stage, or ``auto`` if that camera sees no body, or is inside a shape and sees nothing else.
         device: Warp device; by default Warp's.
         on_camera: Called with a line of text that names the camera.
 

@@ -147,7 +147,7 @@ class Display:
             self.viewer.apply_forces(state)
 
     def follow(self, time: float, state: newton.State) -> bool:
-        """Show a state, and again while the viewer is paused.
+        """Show a state, repeatedly while the viewer is paused.
 
         Args:
             time: Simulated time [s].

@@ -31,8 +31,8 @@ class Balls:
     """Bodies and shapes that :func:`add_balls` has added, in the order of the positions.
 
     Attributes:
-        bodies: The bodies.
-        shapes: Their shapes, one for each body.
+        bodies: Indices of the bodies.
+        shapes: Indices of their shapes, one for each body.
     """
 
     bodies: range

@@ -133,10 +133,10 @@ def add_permanent(
 
     Raises:
         InputError: The attributes are not declared, not exactly one of ``body`` and ``shape`` or of the three strengths
-            is given, nothing or several objects have the label, the shapes have no volume, or a value is out of range.
+            is given, the label matches no or several objects, the shapes have no volume, or a value is out of range.
 
     Warns:
-        UnitWarning: The magnetization is none of a real magnet, or a ball is so large that its radius is likely in
+        UnitWarning: The magnetization is not that of a real magnet, or a ball is so large that its radius is likely in
             another unit.
 
     Example:

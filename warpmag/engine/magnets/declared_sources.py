@@ -67,9 +67,10 @@ def add_coil(
         voltage: Voltage [V] at a coil with a resistance; :meth:`warpmag.Magnetics.set_voltage` changes it. 0 is a
             short circuit.
         turns: Number of turns; a coil with a resistance needs it.
-        inductance: Inductance of a coil with a resistance, in air [H]. By default that of its geometry: all turns in
-            the wire of a loop or a polyline, or in the sheet of a solenoid. A hundredth of that is the least. Coils of
-            a body couple less where a smaller inductance would make the energy of some currents negative.
+        inductance: Inductance of a coil with a resistance, in air [H]. By default computed from the geometry:
+            all turns in the wire of a loop or a polyline, or in the sheet of a solenoid. The smallest valid value is a
+            hundredth of the computed one. The coupling of coils on a body is reduced where a smaller inductance
+            would make the energy of some currents negative.
         xform: Pose of the coil in the frame of the body, or in the world.
         label: Label of the coil, by which :meth:`warpmag.Magnetics.set_current` finds it.
 

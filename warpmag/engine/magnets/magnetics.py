@@ -50,8 +50,8 @@ from warpmag.terminal import collection_paused
 class Magnetics:
     """The magnets of a Newton model: their induction, forces and fields.
 
-    A ball is one moment. Any other shape is a lattice of moments with the exact volume, or fewer moments in its place
-    where every other magnet keeps a distance. Moments of one body exert no forces on each other, and magnets of
+    A ball is one moment. Any other shape is a lattice of moments with the exact volume, or fewer moments where every
+    other magnet is far away. Moments of one body exert no forces on each other, and magnets of
     different worlds do not interact. Use any solver that reads ``State.body_f``::
 
         magnetics = warpmag.Magnetics(model)
@@ -231,11 +231,11 @@ class Magnetics:
         check_state(state, self._model, *names, *(("body_qd",) if self.needs_velocities else ()))
 
     def reset(self, worlds: Any = None) -> None:
-        """Start worlds again, as after :class:`Magnetics` was made; capturable in a graph with an array on the device.
+        """Return worlds to the initial state; capturable in a graph with an array on the device.
 
         Their next induction starts from zero magnetization. Their coil currents and voltages, factors of field maps,
         magnetizations and external fields return to the values from which this object was made; set others afterwards.
-        The state with the poses, changed materials and the other worlds stay. Neighbor lists of touching magnets are
+        Poses in the state, changed materials and other worlds do not change. Neighbor lists of touching magnets are
         rebuilt in all worlds, which may change later results of the others within ``rtol``::
 
             done = wp.array([True, False, False], dtype=wp.bool)  # or a tensor of torch
@@ -297,7 +297,7 @@ class Magnetics:
         Args:
             state: State with poses ``body_q``.
             dt: Time [s] by which the currents of coils with voltages advance; by default they stay.
-            sharing: Factor of ``dt`` on the device, int32, shape [1]: the larger one of this number and 2.
+            sharing: Number of substeps for which the currents advance, at least 2, on the device, int32, shape [1].
 
         Raises:
             InputError: An argument has another type, size or device than it must have, or ``dt`` is not positive.
@@ -537,7 +537,7 @@ class Magnetics:
 
         Parts of the last solve are launched again on their own, on a GPU in graphs. The time of a body is estimated
         from its share of moments, of pairs and of cells near permanent magnets. Bodies that act by few moments in all
-        worlds appear with these. Results stay. Waits for the device::
+        worlds are listed with these moments. The last solve is kept. Waits for the device::
 
             magnetics.apply(state)
             print(magnetics.workload())

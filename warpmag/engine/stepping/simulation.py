@@ -290,9 +290,9 @@ class Simulation:
 
     @property
     def magnetics(self) -> Magnetics:
-        """The magnets at the last solve, in the last step; before the first step at the initial state.
+        """The magnets, with the fields of the last solve: in the last step, or at the start before the first step.
 
-        Waits for the device. Call ``magnetics.induce(simulation.state)`` for the fields at the very present state.
+        Waits for the device. Call ``magnetics.induce(simulation.state)`` for the fields at the present state.
         """
         self._read_reports()
         if not self._magnetics.is_solved:
@@ -306,7 +306,7 @@ class Simulation:
         return self._statistics
 
     def moments_line(self) -> str:
-        """Return the number of moments, and the body that has most of them, in words; nothing is solved for it."""
+        """Return a line with the number of moments and the body that has most of them; solves nothing."""
         return moments_line(self._magnetics)
 
     def warnings(self) -> list[str]:
@@ -345,8 +345,8 @@ class Simulation:
     def reset(self, worlds: Any = None) -> None:
         """Return worlds to the start: poses, velocities, induction, currents, fields; capturable in a graph.
 
-        :attr:`time` and time-sampled values go on, and :attr:`control` stays. See :meth:`Magnetics.reset` for what
-        happens to magnets. Worlds share the length of substeps, which depends on the fastest motion in any world::
+        :attr:`time` and time-sampled values continue, and :attr:`control` is kept. :meth:`Magnetics.reset` describes
+        the reset of magnets. Worlds share the length of substeps, which depends on the fastest motion in any world::
 
             simulation.reset(worlds=[True, False, False])
 
@@ -411,7 +411,8 @@ class Simulation:
 
         Args:
             frames: Output frames after the first; by default the whole stage, else one second.
-            output: USD file to write. A builder's lacks passive springs and, with a warning, joints of several axes.
+            output: USD file to write. From a builder it lacks passive springs and, with a warning, joints of several
+                axes.
             copy_scene: Copy the scene beside the output instead of referencing it. A scene with unsaved edits is always
                 copied.
             resume: Continue the run at the output, if there is one; scene and options must be the same. On a CPU the
