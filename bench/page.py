@@ -109,7 +109,7 @@ def worlds(data: Machines) -> str:
         for name, lines in data.items()
         for line in _cases(lines, "worlds")
     ]
-    return _table(["device", "worlds", "balls in each", "steps of worlds per second"], rows)
+    return _table(["device", "worlds", "balls in each", "world steps per second"], rows)
 
 
 def summary(data: Machines) -> str:
@@ -142,17 +142,17 @@ def _many(lines: list[dict]) -> str:
 
 def _many_worlds(lines: list[dict]) -> str:
     (line,) = _cases(lines, "worlds")
-    return f"{line['worlds']:,} worlds: {_rate(line)} steps of worlds per second"
+    return f"{line['worlds']:,} worlds: {_rate(line)} world steps per second"
 
 
 def _rate(line: dict) -> str:
-    """Steps of worlds per second, two digits."""
+    """World steps per second, two digits."""
     rate = float(f"{line['world_steps_per_second']:.2g}")
     return f"{1e-6 * rate:g} million" if rate >= 1e6 else f"{rate:,.0f}"
 
 
 def rate_of_worlds(data: Machines) -> str:
-    """Return the steps of worlds per second on the GPU."""
+    """Return the world steps per second on the GPU."""
     (line,) = _cases(data[_GPU], "worlds")
     return _rate(line)
 
