@@ -57,25 +57,26 @@ def _text(results: str, seconds: float) -> str:
     balls, letters = (SATURATED[scene] for scene in ("balls_up", "alphabets"))
     return f"""## Stability: the dynamic scenes for {seconds:g} s
 
-**Paper:** in Balls Up the balls do not settle down with kim2018 and do with the paper's method, in Alphabets they are
-blown up and stay together, in Falling Magnet they scatter and cling (Figs. 3 to 6).
+**Paper:** with kim2018 the balls of Balls Up do not settle, the letters of Alphabets are blown up, and the balls of
+Falling Magnet scatter. With the paper's method the balls settle, the letters stay together, and the balls cling (Figs.
+3 to 6).
 
-**Here:** steps of 1 ms, split into substeps by the speeds; "held" are bodies that touch a magnet, directly or through
-others. No body holds the letters, so all of them count. A run ends after {TIME_LIMIT:g} s of wall time.
+**Here:** steps of 1 ms, split into substeps according to the speeds. Bodies are "held" if they touch a magnet, directly
+or through others. No body holds the letters, so all of them count. A run ends after {TIME_LIMIT:g} s of wall time.
 
-Eq. 4 is λ times Kelvin's force on each moment, λ from 8 in weak fields to 1 in saturation. Between two magnets of
-different λ, action and reaction differ, and momentum is not conserved: a free magnet and the balls on one side of it
-accelerate each other, and a heap of letters turns about a moment, by the sum of the law's torques.
+The force of Eq. 4 on a moment is λ times Kelvin's force, where λ falls from 8 in weak fields to 1 in saturation.
+Between two magnets of different λ, action and reaction differ, so momentum is not conserved. A free magnet and the
+balls on one side of it accelerate each other, and a heap of letters turns about a moment.
 
 The paper states no strengths. Its "excessively strong" magnets, and its argument that f'(H) falls as M grows (section
-6.1), are about saturation. "Saturated" are the same scenes with magnets that saturate the bodies they hold: balls at
+6.1), concern saturation. "Saturated" denotes the same scenes with magnets that saturate the bodies they hold: balls at
 {balls["saturation"]:g} A/m in place of 1.7e6, letters at {letters["saturation"]:g} A/m with a moment of
 {letters["moment"]:g} A·m² in place of 12.
 
-"kim2018" are pairs of submagnetizations, Eq. 7 and Kelvin's force, for {SHORT * seconds:g} s; then the step
-κ of the pairs, and the largest number of field evaluations of an induction. The paper states neither.
+"kim2018" denotes pairs of submagnetizations with Eq. 7 and Kelvin's force, for {SHORT * seconds:g} s.
+The step κ of the pairs and the largest number of field evaluations of an induction follow. The paper states neither.
 
-A ball that hangs on one other ball swings forever without friction: in Balls Up a single ball may dominate the RMS. The
-median describes the others.
+Without friction a ball that hangs on another ball swings forever. So a single ball may dominate the RMS speed in Balls
+Up. The median describes the others.
 
 {results}"""

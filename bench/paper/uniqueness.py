@@ -25,16 +25,16 @@ def run(output: Output):
         f"""## Section 6.3: uniqueness
 
 **Paper:** the mean of ‖M_K − M_O‖/‖M_K‖ between Kim et al. 2018 and the paper's method is {PAPERS_DEVIATION:g} under
-the weak bar. The two have different curves, so part of the difference is due to the curves.
+the weak bar. The two methods have different curves, so part of the difference is due to the curves.
 
-**Here:** on one curve each, in float64, to a residual of {RTOL:g}; "from Newton" is ‖M − M_N‖/‖M_N‖ against a float64
-Newton solution that shares no code with the kernels, "from `theta`" the same against the library's method. At most
+**Here:** both methods on the same curve, in float64, to a residual of {RTOL:g}. "From Newton" is ‖M − M_N‖/‖M_N‖ for a
+float64 Newton solution that shares no code with the kernels, "from `theta`" the same for the library's method. At most
 {MOST["llg"]} iterations.
 
 {table(["bar", "curve", "dynamics", "iterations", "residual", "from Newton", "from `theta`"], rows)}
 
 The paper's comparison, `llg` on the clamped curve against `theta` on tanh, mean over the balls. It falls with the
-square of the bar's strength, as (s − tanh s)/s does, so it is the curves' alone:
+square of the bar's strength, as (s − tanh s)/s does, so it is due to the curves alone:
 
 {table(["bar [A/m]", "mean ‖M_K − M_O‖/‖M_K‖"], curves)}"""
     )

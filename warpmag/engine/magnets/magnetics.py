@@ -51,8 +51,8 @@ class Magnetics:
     """The magnets of a Newton model: their induction, forces and fields.
 
     A ball is one moment. Any other shape is a lattice of moments with the exact volume, or fewer moments where every
-    other magnet is far away. Moments of one body exert no forces on each other, and magnets of
-    different worlds do not interact. Use any solver that reads ``State.body_f``::
+    other magnet is far away. Moments of one body exert no forces on each other, and magnets of different worlds do not
+    interact. Use any solver that reads ``State.body_f``::
 
         magnetics = warpmag.Magnetics(model)
         ...
