@@ -1,84 +1,26 @@
-"""The files of a run: whole at every moment, locked, with everything they need, and under any name."""
+"""The files of a run at every moment: frames, ends of any kind, checkpoints, and the memory of the writer."""
 
 import contextlib
 import errno
-import itertools
 import json
 import os
 import random
-import signal
 import subprocess
 import sys
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom
+from pxr import Gf, Sdf
 
+from tests.recorded_balls import NAMES, PATHS, add, assert_has, make_frames, open_scene, read
 from warpmag.errors import InputError
-from warpmag.usd import CacheWriter, open_stage
+from warpmag.usd import CacheWriter
 from warpmag.usd.write.output import Output
-
-PATHS = [f"/World/Ball_{k}" for k in range(3)]
-NAMES = ("xformOp:translate:warpmag", "xformOp:orient:warpmag", "physics:velocity", "physics:angularVelocity")
-BALL = 'def Sphere "Ball_{}" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "WarpmagMagnetAPI"])\n{{\n}}\n'
-SCENE = f"""#usda 1.0
-(
-    metersPerUnit = 1
-    kilogramsPerUnit = 1
-    upAxis = "Z"
-    timeCodesPerSecond = 128
-)
-def Xform "World"
-{{
-{"".join(BALL.format(k) for k in range(3))}
-}}
-"""
 
 
 @pytest.fixture
 def stage(tmp_path):
-    path = tmp_path / "scene.usda"
-    path.write_text(SCENE)
-    return open_stage(path)
-
-
-def make_frames(count, seed=1):
-    """Bodies that all move, from the second frame on; turns stay on one side, so that none changes its sign."""
-    rng = np.random.default_rng(seed)
-    q = rng.normal(size=(count, 3, 7)).astype(np.float32)
-    q[..., 3:] = (0.0, 0.0, 0.0, 1.0) + 0.1 * q[..., 3:]
-    q[..., 3:] /= np.linalg.norm(q[..., 3:], axis=-1, keepdims=True)
-    return q, rng.normal(size=(count, 3, 6)).astype(np.float32), rng.normal(size=(count, 3, 3)).astype(np.float32)
-
-
-def add(writer, frames, numbers, state=None):
-    for k in numbers:
-        writer.add_frame(k / 128, *(values[k] for values in frames))
-        if writer.save_due:
-            writer.save(state() if state else None)
-
-
-def read(output):
-    """Time samples of every attribute of a run's cache that has some."""
-    layer = Sdf.Layer.OpenAsAnonymous(str(output.with_name(f"{output.stem}.cache.usdc")))
-    found = {}
-    for path, name in itertools.product(PATHS, (*NAMES, "warpmag:moment")):
-        at = f"{path}.{name}"
-        found[at] = {time: layer.QueryTimeSample(at, time) for time in layer.ListTimeSamplesForPath(at)}
-    return found
-
-
-def assert_has(output, frames, count):
-    """The stage opens with the first ``count`` frames, exactly as far as they are not computed with."""
-    stage = Usd.Stage.Open(str(output))
-    assert not stage.GetCompositionErrors()
-    for index, path in enumerate(PATHS):
-        samples = read(output)
-        for name, values in ((NAMES[0], frames[0][..., :3]), ("warpmag:moment", frames[2])):
-            found = samples[f"{path}.{name}"]
-            assert list(found) == [float(k) for k in range(count)] or (count == 1 and not found)
-            for time, value in found.items():
-                assert np.array_equal(value, values[round(time), index])
+    return open_scene(tmp_path)
 
 
 def test_every_frame_is_there_as_soon_as_it_is_added(tmp_path, stage):
@@ -315,175 +257,6 @@ def test_what_is_no_run_is_not_resumed(tmp_path, stage):
     output.write_text("#usda 1.0\n")
     with pytest.raises(InputError, match=r"run\.usda: nothing to resume"):
         CacheWriter(stage, output, PATHS, PATHS).resume()
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Who else is there
-# ---------------------------------------------------------------------------------------------------------------------
-
-
-def test_two_runs_with_one_output(tmp_path, stage):
-    output, frames = tmp_path / "run.usda", make_frames(3)
-    (tmp_path / "link").symlink_to(tmp_path)
-    with CacheWriter(stage, output, PATHS, PATHS) as first:
-        add(first, frames, [0])
-        for other in (output, tmp_path / "run.usdc", tmp_path / "link" / "run.usda"):  # one cache
-            with pytest.raises(InputError, match=f"^{other}: another run is writing it$"):
-                add(CacheWriter(stage, other, PATHS, PATHS), frames, [0])
-        add(first, frames, [1, 2])
-    assert_has(output, frames, 3)
-    with CacheWriter(stage, output, PATHS, PATHS) as second:
-        add(second, frames, [0])
-
-
-def test_what_a_killed_run_leaves_is_in_nobodys_way(tmp_path, stage):
-    script = (
-        "import sys, time, numpy as np\n"
-        "from warpmag.usd import CacheWriter, open_stage\n"
-        "writer = CacheWriter(open_stage(sys.argv[1]), sys.argv[2], [], [])\n"
-        "writer.add_frame(0.0, np.zeros((0, 7)), np.zeros((0, 6)), np.zeros((0, 3)))\n"
-        "print('there', flush=True)\n"
-        "time.sleep(1000)\n"
-    )
-    output = tmp_path / "out" / "run.usda"
-    command = [sys.executable, "-c", script, str(tmp_path / "scene.usda"), str(output)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout.readline() == "there\n"
-        with pytest.raises(InputError, match="another run is writing it"):
-            add(CacheWriter(stage, output, PATHS, PATHS), make_frames(1), [0])
-        process.send_signal(signal.SIGKILL)
-    assert len(os.listdir(output.parent)) == 4
-    with CacheWriter(stage, output, PATHS, PATHS) as writer:
-        add(writer, make_frames(1), [0])
-    assert sorted(os.listdir(output.parent)) == ["run.cache.usdc", "run.usda"]
-
-
-def test_links_that_somebody_planted_are_not_followed(tmp_path, stage):
-    victim, folder = tmp_path / "victim", tmp_path / "out"
-    victim.write_text("precious")
-    folder.mkdir()
-    names = ["run.usda", "run.cache.usdc", "run.resume.npz"]
-    names += [f".run{middle}.{os.getpid()}.tmp{end}" for middle, end in (("", ".usda"), (".cache", ".usdc"))]
-    for name in names:
-        (folder / name).symlink_to(victim)
-    with CacheWriter(stage, folder / "run.usda", PATHS, PATHS) as writer:
-        add(writer, make_frames(2), [0, 1], state=dict)
-    assert victim.read_text() == "precious"
-    assert_has(folder / "run.usda", make_frames(2), 2)
-    (folder / ".other.lock").symlink_to(victim)
-    with pytest.raises(InputError, match=r"other\.usda: cannot be written"):
-        add(CacheWriter(stage, folder / "other.usda", PATHS, PATHS), make_frames(1), [0])
-    assert victim.read_text() == "precious"
-
-
-def test_files_are_as_readable_as_others(tmp_path, stage):
-    before = os.umask(0o027)
-    try:
-        with CacheWriter(stage, tmp_path / "run.usda", PATHS, PATHS, copy_scene=True) as writer:
-            add(writer, make_frames(1), [0], state=dict)
-            names = ("run.usda", "run.cache.usdc", "run.scene.usdc", "run.resume.npz")
-            assert {(tmp_path / name).stat().st_mode & 0o777 for name in names} == {0o640}
-    finally:
-        os.umask(before)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Scenes of several files, and names
-# ---------------------------------------------------------------------------------------------------------------------
-
-
-def test_a_copied_scene_has_everything_with_it(tmp_path):
-    """Sublayers, references, payloads and textures, also from folders above the scene's."""
-    project, shared = tmp_path / "project", tmp_path / "shared"
-    (project / "sub").mkdir(parents=True)
-    (shared / "textures").mkdir(parents=True)
-    (shared / "textures" / "iron.png").write_text("a picture")
-    (project / "sub" / "more.usda").write_text('#usda 1.0\nover "World"\n{\n    custom int more = 5\n}\n')
-    ball = '#usda 1.0\n(\n    defaultPrim = "Ball"\n)\n' + BALL.replace("Ball_{}", "Ball").format()
-    (shared / "ball.usda").write_text(ball.replace("{\n}", "{\n    asset file = @./textures/iron.png@\n}"))
-    children = "".join(
-        f'def "Ball_{k}" (\n    {arc} = @../shared/ball.usda@\n)\n{{\n}}\n'
-        for k, arc in enumerate(("references", "payload", "references"))
-    )
-    head = SCENE.split('def Xform "World"')[0].replace("(\n", "(\n    subLayers = [@./sub/more.usda@]\n", 1)
-    (project / "scene.usda").write_text(f'{head}def Xform "World"\n{{\n{children}}}\n')
-    output = tmp_path / "elsewhere" / "run.usda"
-    for _ in range(2):  # the second replaces the first
-        with CacheWriter(open_stage(project / "scene.usda"), output, PATHS, PATHS, copy_scene=True) as writer:
-            add(writer, make_frames(3), range(3))
-    assert sorted(os.listdir(output.parent)) == ["run.cache.usdc", "run.scene", "run.usda"]
-    project.rename(tmp_path / "gone")
-    shared.rename(tmp_path / "gone too")
-    output.parent.rename(tmp_path / "moved")
-    moved = Usd.Stage.Open(str(tmp_path / "moved" / "run.usda"))
-    assert not moved.GetCompositionErrors()
-    assert moved.GetAttributeAtPath("/World.more").Get() == 5
-    for path in PATHS:
-        prim = moved.GetPrimAtPath(path)
-        assert prim.IsA(UsdGeom.Sphere)
-        with open(prim.GetAttribute("file").Get().resolvedPath, encoding="utf-8") as texture:
-            assert texture.read() == "a picture"
-
-
-ODD = [
-    "a b",
-    "a:b",
-    "anon:x",
-    "a@b",
-    "a#b",
-    "@@@x",
-    "a%20b",
-    "%s",
-    "a[b]",
-    "a{b}",
-    "`x`",
-    "µ漢字",
-    "$x",
-    "<UDIM>",
-    "-x",
-    pytest.param("n" * 236, id="files of 255 bytes"),
-]
-REFUSED = ["a\nb", "a\\b", "a\tb", "a\x7fb", "a\udcffb", "a:SDF_FORMAT_ARGS:b=c", "x" * 300, "x" * 252, "x" * 250]
-
-
-@pytest.mark.parametrize("name", ODD)
-def test_odd_names_are_right(tmp_path, monkeypatch, name):
-    folder = tmp_path / name
-    folder.mkdir()
-    (folder / f"{name}.usda").write_text(SCENE)
-    monkeypatch.chdir(folder)
-    for scene, output in ((folder / f"{name}.usda", folder / f"{name}.out.usda"), (f"{name}.usda", f"{name}.usdc")):
-        with CacheWriter(open_stage(scene), output, PATHS, PATHS) as writer:
-            add(writer, make_frames(2), [0, 1])
-        assert Usd.Stage.Open(str(folder / output)).GetPrimAtPath(PATHS[0]).IsA(UsdGeom.Sphere)
-
-
-@pytest.mark.parametrize("name", REFUSED, ids=range(len(REFUSED)))
-def test_names_that_cannot_be_are_refused_in_one_line(tmp_path, stage, name):
-    refusals = [lambda: CacheWriter(stage, tmp_path / f"{name}.usda", [], [])]
-    if len(name) not in (250, 252):  # there may be such a scene
-        refusals.append(lambda: open_stage(tmp_path / f"{name}.usda"))
-    for refusal in refusals:
-        with pytest.raises(InputError) as refused:
-            refusal()
-        message = str(refused.value)
-        assert message.isprintable() and "usda" in message
-    assert os.listdir(tmp_path) == ["scene.usda"]
-
-
-def test_home_and_links_to_folders(tmp_path, monkeypatch):
-    """A link leads to a folder elsewhere: from there the way to the scene is another one."""
-    deep = tmp_path / "some" / "where" / "deep"
-    deep.mkdir(parents=True)
-    (tmp_path / "link").symlink_to(deep)
-    (tmp_path / "scene.usda").write_text(SCENE)
-    monkeypatch.setenv("HOME", str(tmp_path))
-    with CacheWriter(open_stage("~/link/../../../scene.usda"), "~/link/run.usda", PATHS, PATHS) as writer:
-        add(writer, make_frames(2), [0, 1])
-    assert not (tmp_path / "~").exists()
-    for folder in (tmp_path / "link", deep):
-        stage = Usd.Stage.Open(str(folder / "run.usda"))
-        assert not stage.GetCompositionErrors() and stage.GetPrimAtPath(PATHS[0]).IsA(UsdGeom.Sphere)
 
 
 MEMORY = """
