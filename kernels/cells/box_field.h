@@ -46,22 +46,28 @@ CUDA_CALLABLE inline Number edge_logarithms(const BoxView& v, Number half, int a
     return logarithm(upper / lower);
 }
 
-// Solid angle of the two faces across an axis, Σ s arctan(yz/(xR)): x, y and z are any axes, with their bits.
+// Difference of the solid angles of the two faces across an axis, Σ s arctan(yz/(xR)): x, y and z are any axes, with
+// their bits. A diagonal cuts a face into two triangles with corners at a, b and c, whose solid angles are
+//
+//     2 arctan(N/D),    N = |a·(b × c)|,    D = abc + (a·b) c + (a·c) b + (b·c) a
+//
+// (van Oosterom and Strackee 1983). Half the angle of a face is at most π: the argument of the product of both D + iN.
 CUDA_CALLABLE inline Number face_angles(const BoxView& v, const Number* x, const Number* y, const Number* z, int of_x,
                                         int of_y, int of_z) {
-    Number sum = x[0] * Real(0);
-    const Number zero = sum;
+    const Number zero = x[0] * Real(0), area = (y[0] - y[1]) * (z[0] - z[1]), yy = y[0] * y[1], zz = z[0] * z[1];
+    Number sum = zero;
     for (int side = 0; side < 2; ++side) {
-        const Number height = larger(x[side], -x[side]);
-        Number solid = zero;
-        for (int end = 0; end < 2; ++end) {
-            const int corner = (side ? of_x : 0) + (end ? of_z : 0);
-            const Number near = v.distance[corner], far = v.distance[corner + of_y];
-            const Number real = height * height * near * far + y[0] * y[1] * z[end] * z[end];
-            const Number imaginary = height * z[end] * (y[0] * far - y[1] * near);
-            const Number part = angle(imaginary, real);
-            solid += end ? -part : part;
-        }
+        const int corner = side ? of_x : 0;
+        const Number xx = x[side] * x[side], a = v.distance[corner], b = v.distance[corner + of_y + of_z];
+        // of the triangle whose third corner c is at y[end] and z[1 - end]
+        auto denominator = [&](int end) {
+            const Number c = v.distance[corner + (end ? of_y : of_z)];
+            const Number shared_y = y[end] * y[end] + zz, shared_z = z[1 - end] * z[1 - end] + yy;
+            const Number ac = xx + (end ? shared_z : shared_y), bc = xx + (end ? shared_y : shared_z);
+            return a * b * c + (xx + yy + zz) * c + ac * b + bc * a;
+        };
+        const Number height = larger(x[side], -x[side]), n = height * area, d0 = denominator(0), d1 = denominator(1);
+        const Number solid = 2 * angle(larger(n * (d0 + d1), zero), d0 * d1 - n * n);
         const Number outward = x[side] < zero ? -solid : solid;
         sum += side ? outward : -outward;
     }

@@ -16,12 +16,13 @@ namespace warpmag {
 
 constexpr Real SMALLER = Real(0.999); // ratio of volumes from which a box counts as smaller than another one
 
-// Boxes of cells: half sides, rotation to the world as quaternion, volume, the size that scales the window, and the
-// radius of the ball of the same volume. Balls have half sides for the windows only. ``linear`` boxes have differences.
+// Boxes of cells: center, half sides, rotation to the world as quaternion, volume, the size that scales the window, and
+// the radius of the ball of the same volume. Balls have half sides for the windows only. ``linear`` boxes have
+// differences.
 struct Boxes {
-    Vector half;
+    Vector center, half;
     Number q[4], volume, size, radius;
-    Mask ball, linear;
+    Mask ball, linear, inducible;
 };
 
 // Pose of box j relative to box i: separation, and rotation from the frame of j to that of i.
@@ -29,10 +30,10 @@ struct RelativePose {
     Vector r;
     Number q[4];
 };
-CUDA_CALLABLE inline RelativePose relative_pose(Vector apart, const Boxes& own, const Boxes& other) {
+CUDA_CALLABLE inline RelativePose relative_pose(const Boxes& own, const Boxes& other) {
     const Number *a = own.q, *b = other.q;
     return {
-        to_body(rotation_of<Number>(a), apart),
+        to_body(rotation_of<Number>(a), other.center - own.center),
         {a[3] * b[0] - a[0] * b[3] - a[1] * b[2] + a[2] * b[1], a[3] * b[1] - a[1] * b[3] - a[2] * b[0] + a[0] * b[2],
          a[3] * b[2] - a[2] * b[3] - a[0] * b[1] + a[1] * b[0], a[3] * b[3] + a[0] * b[0] + a[1] * b[1] + a[2] * b[2]}};
 }
@@ -81,11 +82,19 @@ CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, cons
             own.linear | other.linear};
 }
 
-// Calls visit(p, signs) for 2³ Gauss points of a box of half sides h, which have equal weights. The signs tell the half
+// Range of the 2³ Gauss points of a box, shares of whose sums are evaluated. Shares that belong to no point are part of
+// the first one's.
+struct Points {
+    int first, count;
+};
+constexpr int POINTS = 8;
+constexpr Points ALL_POINTS = {0, POINTS};
+
+// Calls visit(p, signs) for Gauss points of a box of half sides h, which have equal weights. The signs tell the half
 // along each axis.
-template <class Visit> CUDA_CALLABLE inline void for_gauss_points(Vector h, Visit visit) {
+template <class Visit> CUDA_CALLABLE inline void for_gauss_points(Vector h, Points points, Visit visit) {
     constexpr Real PLACE = Real(0.5773502691896258);
-    for (int k = 0; k < 8; ++k) {
+    for (int k = points.first; k < points.first + points.count; ++k) {
         const Real signs[3] = {Real(k & 1 ? 1 : -1), Real(k & 2 ? 1 : -1), Real(k & 4 ? 1 : -1)};
         visit(Vector{PLACE * signs[0] * h.x, PLACE * signs[1] * h.y, PLACE * signs[2] * h.z}, signs);
     }
@@ -207,30 +216,33 @@ struct PairMatrices {
     Number means[9], of_differences[9], at_differences[9], differences[9];
 };
 // The fields of the source, averaged over the Gauss points of the target.
-CUDA_CALLABLE inline PairMatrices boxes_matrices(const BoxPair& p) {
+CUDA_CALLABLE inline PairMatrices boxes_matrices(const BoxPair& p, Points points) {
     const SourceAndTarget s(p);
     const Number zero = p.unit * Real(0);
-    const bool linear = any(p.linear); // half of a uniform box is half of its field
-    PairMatrices sums;                 // rows in the frame of the target, columns in that of the source
-    for (int k = 0; k < 9; ++k)
-        sums.means[k] = sums.of_differences[k] = sums.at_differences[k] = sums.differences[k] = zero;
-    for_gauss_points(s.target_half, [&](Vector x, const Real* signs) {
+    const bool linear = any(p.linear); // uniform boxes have no differences
+    Symmetric total = {zero, zero, zero, zero, zero, zero};
+    PairMatrices sums; // rows in the frame of the target, columns in that of the source
+    for (int k = 0; k < 9; ++k) sums.of_differences[k] = sums.at_differences[k] = sums.differences[k] = zero;
+    for_gauss_points(s.target_half, points, [&](Vector x, const Real* signs) {
         const Vector at = s.center + to_world(s.rotation, x);
         const Symmetric full = s.tensor(at);
-        for (int l = 0; l < 3; ++l) {
-            const Vector of_both = column(full, l);
-            const Vector of_upper = linear ? column(s.upper_half_tensor(at, l), l) : Real(0.5) * of_both;
+        total = total + full;
+        for (int l = 0; l < 3 && linear; ++l) {
+            const Vector of_both = column(full, l), of_upper = column(s.upper_half_tensor(at, l), l);
             const Vector mean = to_body(s.rotation, of_both), difference = to_body(s.rotation, 2 * of_upper - of_both);
             const Number by_mean[3] = {mean.x, mean.y, mean.z},
                          by_difference[3] = {difference.x, difference.y, difference.z};
             for (int k = 0; k < 3; ++k) {
-                sums.means[3 * k + l] += by_mean[k];
                 sums.of_differences[3 * k + l] += by_difference[k];
                 sums.at_differences[3 * k + l] += signs[k] * by_mean[k];
                 sums.differences[3 * k + l] += signs[k] * by_difference[k];
             }
         }
     });
+    for (int l = 0; l < 3; ++l) {
+        const Vector mean = to_body(s.rotation, column(total, l));
+        sums.means[l] = mean.x, sums.means[3 + l] = mean.y, sums.means[6 + l] = mean.z;
+    }
     PairMatrices result; // of the pair: transposed where i is the source
     const Mask own = p.own_points;
     for (int k = 0; k < 3; ++k)
@@ -305,14 +317,15 @@ CUDA_CALLABLE inline void far_matrix(const BoxPair& p, Number* matrix) {
     }
 }
 
-// Matrices of the pair less the law of the balls, in the units of the pair.
-CUDA_CALLABLE inline PairMatrices pair_matrices(const BoxPair& p) {
+// Share of Gauss points in the matrices of the pair less the law of the balls, in the units of the pair.
+CUDA_CALLABLE inline PairMatrices pair_matrices(const BoxPair& p, Points points) {
     const Number zero = p.unit * Real(0), close = p.close.value;
     PairMatrices result;
-    far_matrix(p, result.means);
-    for (int k = 0; k < 9; ++k) result.of_differences[k] = result.at_differences[k] = result.differences[k] = zero;
+    for (int k = 0; k < 9; ++k)
+        result.means[k] = result.of_differences[k] = result.at_differences[k] = result.differences[k] = zero;
+    if (points.first == 0) far_matrix(p, result.means);
     if (!any(close > zero)) return result;
-    const PairMatrices boxes = boxes_matrices(p);
+    const PairMatrices boxes = boxes_matrices(p, points);
     for (int k = 0; k < 9; ++k) {
         result.means[k] += close * boxes.means[k];
         result.of_differences[k] = close * boxes.of_differences[k];
@@ -341,7 +354,7 @@ struct PairMoments {
 
 // Wrench of close boxes. The source is a box of its mean less its differences, and the upper halves of twice each
 // difference. Balls have no differences.
-CUDA_CALLABLE inline Wrench boxes_wrench(const BoxPair& p, const PairMoments& moments) {
+CUDA_CALLABLE inline Wrench boxes_wrench(const BoxPair& p, const PairMoments& moments, Points points) {
     const SourceAndTarget s(p);
     const Number zero = p.unit * Real(0);
     const Mask own = p.own_points;
@@ -351,7 +364,7 @@ CUDA_CALLABLE inline Wrench boxes_wrench(const BoxPair& p, const PairMoments& mo
     const Vector at_source = s.choose(own, moments.other_difference, moments.own_difference);
     Vector force = {zero, zero, zero}, torque = force; // on the target, about the center of the source
     Number work = zero;
-    for_gauss_points(s.target_half, [&](Vector x, const Real* signs) {
+    for_gauss_points(s.target_half, points, [&](Vector x, const Real* signs) {
         const Vector at = s.center + to_world(s.rotation, x);
         const Vector difference = {signs[0] * at_target.x, signs[1] * at_target.y, signs[2] * at_target.z};
         const Vector here = of_target + to_world(s.rotation, difference);
@@ -404,20 +417,27 @@ CUDA_CALLABLE inline Wrench ball_wrench(const BoxPair& p, Vector m, Vector e) {
     return {g2 * (um * e + ue * m) + radial * u, cross(m, field), dot(m, field)};
 }
 
-// Wrench of the pair less that of the balls, with its windows.
-CUDA_CALLABLE inline Wrench pair_wrench(const BoxPair& p, const PairMoments& moments) {
+// Share of Gauss points in the wrench of the pair less that of the balls, with its windows.
+CUDA_CALLABLE inline Wrench pair_wrench(const BoxPair& p, const PairMoments& moments, Points points) {
     const Vector m = moments.m, e = moments.e;
     const Number zero = p.unit * Real(0), close = p.close.value;
     const Vector none = {zero, zero, zero}, inward = -1 / larger(length(p.r), zero + Real(1e-12)) * p.r;
-    const Wrench far = quadrupole_wrench(p, m, e);
     Wrench sum = {none, none, zero};
-    sum.add(1 - close, far);
-    Number change = -far.work; // of the work with the window of close boxes
+    Number change = zero; // of the work with the window of close boxes
+    if (points.first == 0) {
+        const Wrench far = quadrupole_wrench(p, m, e);
+        sum.add(1 - close, far);
+        change = -far.work;
+    }
     if (any(close > zero)) {
-        const Wrench boxes = boxes_wrench(p, moments), ball = ball_wrench(p, m, e);
+        const Wrench boxes = boxes_wrench(p, moments, points);
         sum.add(close, boxes);
-        sum.add(-close, ball);
-        change += boxes.work - ball.work;
+        change += boxes.work;
+        if (points.first == 0) {
+            const Wrench ball = ball_wrench(p, m, e);
+            sum.add(-close, ball);
+            change -= ball.work;
+        }
     }
     const Number radial = p.window.value * p.close.slope * change + p.window.slope * sum.work;
     return {p.window.value * sum.force + radial * inward, p.window.value * sum.torque, zero};

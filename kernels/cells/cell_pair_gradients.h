@@ -37,14 +37,14 @@ struct CellSums {
 CUDA_CALLABLE inline Wrench wrench_between(const BoxPair& p, const CellMoments& m, const CellMoments& e) {
     const Number cube = p.unit * p.unit * p.unit;
     const PairMoments moments = {m.mean, cube * to_world(p.rotation, e.mean), m.difference, cube * e.difference};
-    const Wrench wrench = pair_wrench(p, moments);
+    const Wrench wrench = pair_wrench(p, moments, ALL_POINTS);
     return {p.unit * wrench.force, wrench.torque, wrench.work};
 }
 
 // Fields of box j at box i: mean, and half the difference of the halves.
 CUDA_CALLABLE inline CellMoments field_between(const BoxPair& p, const CellMoments& e) {
     const Number factor = p.window.value * p.unit * p.unit * p.unit;
-    const PairMatrices k = pair_matrices(p);
+    const PairMatrices k = pair_matrices(p, ALL_POINTS);
     auto times = [](const Number* rows, Vector v) {
         return Vector{rows[0] * v.x + rows[1] * v.y + rows[2] * v.z, rows[3] * v.x + rows[4] * v.y + rows[5] * v.z,
                       rows[6] * v.x + rows[7] * v.y + rows[8] * v.z};
@@ -61,18 +61,17 @@ CUDA_CALLABLE inline Boxes turned(Boxes box, Vector v) {
     return box;
 }
 
-// A vector of pairs, of which some are ``listed``: boxes, the separation, and whether cell i precedes its candidate.
+// A vector of pairs, of which some are ``listed``: boxes, and whether cell i precedes its candidate.
 struct CellPair {
     Boxes box, other;
-    Vector apart;
     Mask listed, first;
 
-    CUDA_CALLABLE BoxPair in_units() const {
-        return box_pair(box, other, relative_pose(apart, box, other), listed, first);
-    }
-    // The pair after a small motion.
+    CUDA_CALLABLE BoxPair in_units() const { return box_pair(box, other, relative_pose(box, other), listed, first); }
+    // The pair after a small motion, in which box j moves by ``shift`` relative to box i.
     CUDA_CALLABLE CellPair moved(Vector shift, Vector turn, Vector other_turn) const {
-        return {turned(box, turn), turned(other, other_turn), apart + shift, listed, first};
+        CellPair pair = {turned(box, turn), turned(other, other_turn), listed, first};
+        pair.other.center += shift;
+        return pair;
     }
 };
 
@@ -115,33 +114,29 @@ CUDA_CALLABLE inline void add_wrench_gradient(const CellPair& at, const CellMome
 template <class Gradients> CUDA_CALLABLE inline void differentiate_row(const Gradients& g, int pass, int row) {
     const auto& a = g.pairs;
     if (row >= a.cell.shape[0]) return;
-    const PairReader reader(a);
-    int counts[WIDTH];
-    const Cells own = reader.own(row, counts);
-    const int slots = largest_count(counts);
-    if (slots == 0) return;
-    const Boxes box = reader.boxes(own);
-    const Vector x = reader.position(own);
+    const Rows rows(a, row);
+    if (rows.slots == 0) return;
+    const Boxes box = rows.boxes(rows.own);
     const Real *const shifts = (const Real*)g.shift.data, *const turns = (const Real*)g.turn.data;
-    const CellMoments m = moments_of(g.moments, own), eta = moments_of(g.cotangents, own);
-    const Vector shift = vectors_of(shifts, own), turn = vectors_of(turns, own);
+    const CellMoments m = moments_of(g.moments, rows.own), eta = moments_of(g.cotangents, rows.own);
+    const Vector shift = vectors_of(shifts, rows.own), turn = vectors_of(turns, rows.own);
     const Number zero = box.size * Real(0);
     const Vector none = {zero, zero, zero};
     CellSums sums = {none, none, none, none};
-    for (int slot = share(); slot < slots; slot += SHARES) {
-        const Cells other = reader.candidates(own, counts, slot);
-        const CellPair pair = {box, reader.boxes(other), reader.position(other) - x,
-                               mask_of(indices(own.at) != indices(other.at)), precedes(own, other)};
+    for (int slot = share(); slot < rows.slots; slot += SHARES) {
+        const Cells other = rows.candidates(slot);
+        const CellPair pair = {box, rows.boxes(other), rows.listed(other), precedes(rows.own, other)};
         const CellMoments other_m = moments_of(g.moments, other);
         if (pass == OF_FIELD) add_field_gradient(pair, m, eta, other_m, moments_of(g.cotangents, other), sums);
         else
             add_wrench_gradient(pair, m, other_m, vectors_of(shifts, other) - shift, turn, vectors_of(turns, other),
                                 sums);
     }
-    add_to_cells((Real*)g.by_positions.data, own, counts, group_sums(sums.by_position), 1);
-    add_to_cells((Real*)g.by_turns.data, own, counts, group_sums(sums.by_turn), 1);
-    add_to_cells((Real*)g.fields.data, own, counts, to_world(rotation_of<Number>(box.q), group_sums(sums.field)), 1);
-    add_to_cells((Real*)g.difference_fields.data, own, counts, group_sums(sums.difference_field), 1);
+    const Rotation<Number> frame = rotation_of<Number>(box.q);
+    add_to_cells((Real*)g.by_positions.data, rows.own, rows.counts, group_sums(sums.by_position), 1);
+    add_to_cells((Real*)g.by_turns.data, rows.own, rows.counts, group_sums(sums.by_turn), 1);
+    add_to_cells((Real*)g.fields.data, rows.own, rows.counts, to_world(frame, group_sums(sums.field)), 1);
+    add_to_cells((Real*)g.difference_fields.data, rows.own, rows.counts, group_sums(sums.difference_field), 1);
 }
 
 template <class Word, class Gradients>

@@ -10,6 +10,7 @@ from functools import cache
 import warp as wp
 
 from warpmag.kernels.cells.cell_pairs import CELLS_PER_THREAD, cell_pairs_type, pair_constants
+from warpmag.kernels.cells.couplings import padded_vectors
 from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes, threads_for
@@ -18,7 +19,7 @@ _OF_FIELD, _OF_WRENCH = range(2)
 """The passes; as in ``cell_pair_gradients.h``."""
 _STEP = 3e-6
 """Largest motion of a pair in a difference, in mean sizes and radians: about the cube root of the precision."""
-_SHARED_ARRAYS = "body", "linear", "candidate", "candidate_count", "rows", "cell"
+_SHARED_ARRAYS = "candidate", "candidate_count", "rows", "cell", "column"
 """Arrays of whole numbers that are those of the pairs."""
 
 
@@ -71,22 +72,19 @@ class CellPairGradients:
         self.arrays = g = CellPairGradientArrays()
         for name in _SHARED_ARRAYS:
             setattr(g.pairs, name, getattr(pairs, name))
-        for name, dtype in (("packed", wp.float64), ("half", wp.float64), ("grid", wp.quatd), ("frame", wp.quatd)):
-            setattr(g.pairs, name, wp.zeros(getattr(pairs, name).shape, dtype=dtype, device=self._device))
+        g.pairs.box = wp.zeros(pairs.box.shape, dtype=wp.float64, device=self._device)
 
         def vectors():
-            return wp.zeros(n, dtype=wp.vec3d, device=self._device)
+            return padded_vectors(n, wp.vec3d, self._device)
 
         for moments in (g.moments, g.cotangents):
             moments.means, moments.differences = vectors(), vectors()
         g.shift, g.turn = vectors(), vectors()
         self._results = g.by_positions, g.by_turns, g.fields, g.difference_fields = tuple(vectors() for _ in range(4))
-        cast(pairs.half, g.pairs.half)
 
     def load(self) -> None:
-        """Copy the poses of the pairs, after their ``find``."""
-        cast(self._given.packed, self.arrays.pairs.packed)
-        cast(self._given.frame, self.arrays.pairs.frame)
+        """Copy the boxes of the pairs, after their ``find``."""
+        cast(self._given.box, self.arrays.pairs.box)
 
     def load_moments(self) -> None:
         """Copy the moments whose field the pairs have just evaluated."""

@@ -26,15 +26,22 @@ constexpr int CLASSES = 16, BINS = CLASSES * CLASSES; // of rows by their number
 enum CellPairPass { LOCATE, CLEAR, SELECT, ARRANGE, ASSIGN, TABULATE, TAKE_BALLS, ADD_FIELD, ADD_FORCE };
 // as in cell_pairs.py
 
-// Writes the frame of body i, and raises a flag if cell i has moved so far that candidates are searched again.
+// Writes the box of moment i, and raises a flag if it has moved so far that candidates are searched again.
 template <class Pairs> CUDA_CALLABLE inline void locate(const Pairs& a, int i) {
-    if (i < a.grid.shape[0]) put_product(a.rotation.data[i], a.grid.data[i], a.frame.data[i]);
     if (i >= a.group.shape[0] || a.group.data[i] < 0) return;
-    const Real* const row = (const Real*)a.packed.data + i;
-    const size_t pitch = a.packed.strides[0] / sizeof(Real);
+    const Real *const row = (const Real*)a.packed.data + i, *const half = a.half.data + i;
+    const size_t pitch = a.packed.strides[0] / sizeof(Real), cells = a.half.shape[1];
+    const int body = a.body.data[i];
+    const bool is_ball = body >= a.grid.shape[0];
+    Real* const line = a.box.data + LINE * (size_t)i;
+    Real* const turn = line + 8;
+    for (int k = 0; k < 4; ++k) line[k] = row[k * pitch], line[4 + k] = half[k * cells], turn[k] = k == 3;
+    if (!is_ball) put_product(a.rotation.data[body], a.grid.data[body], turn);
+    line[12] = is_ball ? BALL * line[3] * line[3] * line[3] : 8 * line[4] * line[5] * line[6];
+    line[13] = is_ball, line[14] = a.linear.data[body], line[15] = a.inducible.data[i];
     const Real* const listed = (const Real*)a.found_at.data + 3 * (size_t)i;
-    const Real x = row[0] - listed[0], y = row[pitch] - listed[1], z = row[2 * pitch] - listed[2];
-    const Real limit = MARGIN / 2 * a.half.data[i + 3 * (size_t)a.half.shape[1]];
+    const Real x = line[0] - listed[0], y = line[1] - listed[1], z = line[2] - listed[2];
+    const Real limit = MARGIN / 2 * line[7];
     if (!(x * x + y * y + z * z <= limit * limit)) raise_flag(*a.moved.data);
 }
 
@@ -46,26 +53,19 @@ CUDA_CALLABLE inline int increment(int* count) {
 #endif
 }
 
-// Puts the candidates of cell i that may be close before all others, and returns their number.
-template <class Pairs> CUDA_CALLABLE inline int part_candidates(const Pairs& a, int i, int count) {
-    const Real* const x = (const Real*)a.packed.data;
-    const size_t pitch = a.packed.strides[0] / sizeof(Real), cells = a.half.shape[1];
-    int* const list = a.candidate.data + (size_t)i * a.candidate.shape[1];
-    auto longest_half = [&](int j) {
-        const Real* const half = a.half.data + j;
-        return larger(half[0], larger(half[cells], half[2 * cells]));
-    };
-    const Real own_half = longest_half(i);
-    int close = 0;
-    for (int k = 0; k < count; ++k) {
-        const int j = list[k];
-        const Real r[3] = {x[j] - x[i], x[j + pitch] - x[i + pitch], x[j + 2 * pitch] - x[i + 2 * pitch]};
-        const Real reach = (CLOSE_END + MARGIN) * (own_half + longest_half(j));
-        if (!(r[0] * r[0] + r[1] * r[1] + r[2] * r[2] < reach * reach)) continue;
-        list[k] = list[close];
-        list[close++] = j;
-    }
-    return close;
+// Kinds of candidates, in the order of a row, so that vectors of rows have few different ones in a slot. Differences
+// act between the first two, the others are too far for their longest sides.
+enum CandidateKind { CLOSE_NOW, MAY_BE_CLOSE, CLOSE_AND_FLAT, NEAR_NOW, MAY_BE_NEAR, KINDS };
+
+template <class Pairs> CUDA_CALLABLE inline int kind_of(const Pairs& a, int i, int j) {
+    const Real *const own = a.box.data + LINE * (size_t)i, *const other = a.box.data + LINE * (size_t)j;
+    auto longest_half = [](const Real* line) { return larger(line[4], larger(line[5], line[6])); };
+    const Real r[3] = {other[0] - own[0], other[1] - own[1], other[2] - own[2]};
+    const Real d2 = r[0] * r[0] + r[1] * r[1] + r[2] * r[2];
+    const Real size = (own[7] + other[7]) / 2, d = (CLOSE_END + MARGIN) * (longest_half(own) + longest_half(other));
+    const bool close = d2 < CLOSE_END * size * CLOSE_END * size;
+    if (d2 < d * d) return close ? CLOSE_NOW : MAY_BE_CLOSE;
+    return close ? CLOSE_AND_FLAT : d2 < WINDOW_END * size * WINDOW_END * size ? NEAR_NOW : MAY_BE_NEAR;
 }
 
 // Class of a number of candidates: class 0 has the largest numbers.
@@ -73,14 +73,21 @@ CUDA_CALLABLE inline int class_of(int number) { return number < CLASSES ? CLASSE
 
 // Prepares cell i for a row after a search, if it has candidates. Cells with too many candidates have none.
 template <class Pairs> CUDA_CALLABLE inline void select(const Pairs& a, int i) {
-    a.bin.data[i] = -1;
     const int count = a.group.data[i] < 0 ? 0 : a.candidate_count.data[i];
+    if (share() == 0) a.bin.data[i] = -1;
     if (count > a.candidate.shape[1]) raise_flag(*a.crowded.data);
     if (count == 0 || count > a.candidate.shape[1]) return;
-    const int close = part_candidates(a, i, count);
-    a.close_count.data[i] = close;
-    if (close > a.close_capacity) raise_flag(*a.crowded.data);
-    a.bin.data[i] = CLASSES * class_of((close + 1) / 2) + class_of(count / 16);
+    int kinds[KINDS] = {};
+    for (int k = share(); k < count; k += SHARES) {
+        const int kind = kind_of(a, i, a.candidate.data[(size_t)i * a.candidate.shape[1] + k]);
+        for (int n = 0; n < KINDS; ++n) kinds[n] += n == kind;
+    }
+    for (int n = 0; n < KINDS; ++n) kinds[n] = group_count(kinds[n]);
+    if (share() != 0) return;
+    for (int n = 0; n < KINDS; ++n) a.kinds.data[KINDS * (size_t)i + n] = kinds[n];
+    const int close = kinds[CLOSE_NOW] + kinds[MAY_BE_CLOSE];
+    if (close > a.close_capacity && a.close_capacity > 0) raise_flag(*a.crowded.data);
+    a.bin.data[i] = CLASSES * class_of((kinds[CLOSE_NOW] + 1) / 2) + class_of(count / 16);
     increment(a.bin_end.data + a.bin.data[i]);
 }
 
@@ -95,13 +102,27 @@ template <class Pairs> CUDA_CALLABLE inline void arrange(const Pairs& a) {
     a.rows.data[0] = rows;
 }
 
-// Gives a row to cell i, with poses of no pair, so that all entries are computed.
+// Gives a row to cell i, with poses of no pair, so that all entries are computed. Crowded candidates take no part: the
+// cell itself replaces them.
 template <class Pairs> CUDA_CALLABLE inline void assign(const Pairs& a, int i) {
     if (a.bin.data[i] < 0) return;
-    const int row = increment(a.bin_end.data + a.bin.data[i]), count = a.candidate_count.data[i];
-    a.cell.data[row] = i;
-    Real* const poses = a.pose.data;
-    for (int slot = 0; slot < count; ++slot) slot_at(poses, a.candidate.shape[1], POSE_ROWS, slot, row)[3 * CHUNK] = 9;
+    const int count = a.candidate_count.data[i], capacity = a.candidate.shape[1];
+    const int row = of_first_share(share() == 0 ? increment(a.bin_end.data + a.bin.data[i]) : 0);
+    if (share() == 0) a.cell.data[row] = i;
+    int next[KINDS] = {};
+    for (int n = 1; n < KINDS; ++n) next[n] = next[n - 1] + a.kinds.data[KINDS * (size_t)i + n - 1];
+    for (int first = 0; first < count; first += SHARES) {
+        const int k = first + share(), j = k < count ? a.candidate.data[(size_t)i * capacity + k] : i;
+        const int kind = k < count ? kind_of(a, i, j) : KINDS;
+        int slot = count;
+        for (int n = 0; n < KINDS; ++n) {
+            const int place = next_place(n == kind, next[n]);
+            slot = n == kind ? place : slot;
+        }
+        if (k >= count) continue;
+        *list_at(a.column.data, capacity, slot, row) = a.candidate_count.data[j] > capacity ? i : j;
+        slot_at(a.pose.data, capacity, POSE_ROWS, slot, row)[3 * CHUNK] = 9;
+    }
 }
 
 // Cells of a vector of rows, or their candidates: index, and 0 where there is none.
@@ -114,68 +135,86 @@ CUDA_CALLABLE inline Mask precedes(const Cells& own, const Cells& other) {
     return mask_of(indices(own.at) < indices(other.at));
 }
 
-template <class Pairs> struct PairReader {
+// A vector of rows: own cells, and their numbers of candidates, 0 beyond the last row.
+template <class Pairs> struct Rows {
     const Pairs& a;
-    const Real* const packed;
-    const size_t pitch;
-    const int capacity; // of a list of candidates
+    const int row, capacity; // first row, and length of a list of candidates
+    Cells own;
+    int counts[WIDTH], slots; // number of candidates of each row, and the largest
 
-    CUDA_CALLABLE explicit PairReader(const Pairs& a)
-        : a(a), packed((const Real*)a.packed.data), pitch(a.packed.strides[0] / sizeof(Real)),
-          capacity(a.candidate.shape[1]) {}
-    CUDA_CALLABLE Number row(int k, const Cells& c) const { return gather(packed + k * pitch, c.at); }
-    CUDA_CALLABLE Vector position(const Cells& c) const { return {row(0, c), row(1, c), row(2, c)}; }
-    CUDA_CALLABLE Vector moment(const Cells& c) const { return {row(4, c), row(5, c), row(6, c)}; }
-    CUDA_CALLABLE Boxes boxes(const Cells& c) const {
-        const size_t cells = a.half.strides[0] / sizeof(Real);
-        Boxes b;
-        b.half = {gather(a.half.data, c.at), gather(a.half.data + cells, c.at), gather(a.half.data + 2 * cells, c.at)};
-        int body[WIDTH], is_box[WIDTH], is_linear[WIDTH], none[WIDTH] = {};
-        for (int l = 0; l < WIDTH; ++l) {
-            body[l] = 4 * a.body.data[c.at[l]];
-            is_box[l] = a.body.data[c.at[l]] < a.grid.shape[0];
-            is_linear[l] = a.linear.data[a.body.data[c.at[l]]];
-        }
-        const Real* const frames = (const Real*)a.frame.data;
-        for (int k = 0; k < 4; ++k) b.q[k] = gather(frames + k, body);
-        b.radius = row(3, c);
-        b.ball = mask_of(indices(is_box) == indices(none));
-        b.linear = mask_of(indices(none) < indices(is_linear));
-        b.volume = b.ball ? BALL * b.radius * b.radius * b.radius : 8 * b.half.x * b.half.y * b.half.z;
-        b.size = gather(a.half.data + 3 * cells, c.at);
-        return b;
-    }
-    CUDA_CALLABLE Mask is_inducible(const Cells& c) const {
-        int values[WIDTH], none[WIDTH] = {};
-        for (int l = 0; l < WIDTH; ++l) values[l] = a.inducible.data[c.at[l]];
-        return mask_of(indices(none) < indices(values));
-    }
-    // Own cells of rows from ``row`` on, and the number of candidates of each, 0 beyond the last row.
-    CUDA_CALLABLE Cells own(int row, int* counts) const {
+    CUDA_CALLABLE Rows(const Pairs& a, int row) : a(a), row(row), capacity(a.candidate.shape[1]) {
         const int rows = *a.rows.data;
-        Cells c;
         for (int l = 0; l < WIDTH; ++l) {
-            c.at[l] = row + l < rows ? a.cell.data[row + l] : a.cell.data[row / CHUNK * CHUNK];
-            counts[l] = row + l < rows ? a.candidate_count.data[c.at[l]] : 0;
+            own.at[l] = row + l < rows ? a.cell.data[row + l] : a.cell.data[row / CHUNK * CHUNK];
+            counts[l] = row + l < rows ? a.candidate_count.data[own.at[l]] : 0;
         }
-        return c;
+        slots = largest_count(counts);
+    }
+    // Largest number of candidates with which differences act.
+    CUDA_CALLABLE int close_slots() const {
+        int close[WIDTH];
+        for (int l = 0; l < WIDTH; ++l) {
+            const int* const kinds = a.kinds.data + KINDS * (size_t)own.at[l];
+            close[l] = counts[l] == 0 ? 0 : kinds[CLOSE_NOW] + kinds[MAY_BE_CLOSE];
+        }
+        return largest_count(close);
     }
     // Candidates of a slot; where there is none, or it takes no part, the own cell.
-    CUDA_CALLABLE Cells candidates(const Cells& own, const int* counts, int slot) const {
+    CUDA_CALLABLE Cells candidates(int slot) const {
+        const int* const column = list_at(a.column.data, capacity, slot, row);
         Cells c;
-        for (int l = 0; l < WIDTH; ++l) {
-            const int j = slot < counts[l] ? a.candidate.data[(size_t)own.at[l] * capacity + slot] : own.at[l];
-            c.at[l] = a.candidate_count.data[j] > capacity ? own.at[l] : j;
-        }
+        for (int l = 0; l < WIDTH; ++l) c.at[l] = slot < counts[l] ? column[l] : own.at[l];
         return c;
+    }
+    CUDA_CALLABLE Boxes boxes(const Cells& c) const {
+        const Four place = four_at(a.box.data, 0, c.at), sides = four_at(a.box.data, 1, c.at),
+                   turn = four_at(a.box.data, 2, c.at), kind = four_at(a.box.data, 3, c.at);
+        return {{place.x, place.y, place.z},
+                {sides.x, sides.y, sides.z},
+                {turn.x, turn.y, turn.z, turn.w},
+                kind.x,
+                sides.w,
+                place.w,
+                kind.y > Real(0),
+                kind.z > Real(0),
+                kind.w > Real(0)};
+    }
+    // Where a candidate is another cell.
+    CUDA_CALLABLE Mask listed(const Cells& other) const { return mask_of(indices(own.at) != indices(other.at)); }
+    CUDA_CALLABLE BoxPair pair(const Boxes& box, const Cells& other, const Boxes& other_box,
+                               const RelativePose& pose) const {
+        return box_pair(box, other_box, pose, listed(other), precedes(own, other));
     }
 };
 
-// Writes numbers where pairs have moved, 0 where they are not near.
-CUDA_CALLABLE inline void put_moved(Real* rows, const Number* values, int count, Number factor, Mask moved, Mask near) {
-    for (int k = 0; k < count; ++k) {
+// Calls visit(slot, points) for the candidates of a row, of which the first ``close`` may be close. On a GPU threads
+// share the Gauss points of these.
+template <class Visit> CUDA_CALLABLE inline void for_candidates(int slots, int close, Visit visit) {
+    int others = 0;
+    if (SHARES >= POINTS) {
+        others = close;
+        for (int k = share(); k < POINTS * close; k += SHARES) visit(k / POINTS, Points{k % POINTS, 1});
+    }
+    for (int slot = others + share(); slot < slots; slot += SHARES) visit(slot, ALL_POINTS);
+}
+
+// Sum over the threads that share the Gauss points of a candidate.
+CUDA_CALLABLE inline Number points_sum(Number part, Points points) {
+#if defined(__CUDA_ARCH__)
+    if (points.count == POINTS) return part;
+    const unsigned mask = ((1u << POINTS) - 1) << (threadIdx.x % 32 / POINTS * POINTS);
+    for (int step = 1; step < POINTS; step *= 2) part += __shfl_xor_sync(mask, part, step);
+#endif
+    return part;
+}
+
+// Writes sums over Gauss points where pairs have moved, 0 where they are not near.
+CUDA_CALLABLE inline void put_moved(Real* rows, const Number* values, Points points, Number factor, Mask moved,
+                                    Mask near) {
+    for (int k = 0; k < 9; ++k) {
+        const Number sum = points_sum(values[k], points);
         Real* const row = rows + k * CHUNK;
-        put(row, moved ? (near ? factor * values[k] : factor * Real(0)) : numbers(row));
+        if (points.first == 0) put(row, moved ? (near ? factor * sum : factor * Real(0)) : numbers(row));
     }
 }
 CUDA_CALLABLE inline Vector matrix_times(const Real* rows, Vector v) {
@@ -185,61 +224,71 @@ CUDA_CALLABLE inline Vector matrix_times(const Real* rows, Vector v) {
     };
     return {row_times(0), row_times(1), row_times(2)};
 }
-// Vectors of cells in an array of vectors.
+// Vectors of cells in an array of vectors, which has one vector more.
 CUDA_CALLABLE inline Vector vectors_of(const Real* array, const Cells& cells) {
-    int place[WIDTH];
-    for (int l = 0; l < WIDTH; ++l) place[l] = 3 * cells.at[l];
-    return {gather(array, place), gather(array + 1, place), gather(array + 2, place)};
+#if defined(__CUDA_ARCH__)
+    const Real* const v = array + 3 * (size_t)*cells.at;
+    return {v[0], v[1], v[2]};
+#else
+    const Four v = load_fours([&](int l) { return array + 3 * (size_t)cells.at[l]; });
+    return {v.x, v.y, v.z};
+#endif
 }
 
-// Stores relative poses that have changed; returns where they have.
-CUDA_CALLABLE inline Mask store_pose(Real* rows, const RelativePose& pose, Number size) {
-    const Number now[POSE_ROWS] = {pose.r.x, pose.r.y, pose.r.z, pose.q[0], pose.q[1], pose.q[2], pose.q[3]};
-    Number change = size * Real(0);
-    for (int k = 0; k < POSE_ROWS; ++k) {
-        const Number difference = now[k] - numbers(rows + k * CHUNK), scaled = k < 3 ? difference / size : difference;
-        change = larger(change, larger(scaled, -scaled));
+// Relative pose of a pair in numbers, and where it differs from the stored one.
+struct PoseRows {
+    Number now[POSE_ROWS];
+    Mask moved;
+
+    CUDA_CALLABLE PoseRows(const Real* rows, const RelativePose& pose, Number size)
+        : now{pose.r.x, pose.r.y, pose.r.z, pose.q[0], pose.q[1], pose.q[2], pose.q[3]} {
+        Number change = size * Real(0);
+        for (int k = 0; k < POSE_ROWS; ++k) {
+            const Number difference = now[k] - numbers(rows + k * CHUNK),
+                         scaled = k < 3 ? difference / size : difference;
+            change = larger(change, larger(scaled, -scaled));
+        }
+        moved = change > POSE_TOLERANCE;
     }
-    const Mask moved = change > POSE_TOLERANCE;
-    for (int k = 0; k < POSE_ROWS && any(moved); ++k) put(rows + k * CHUNK, moved ? now[k] : numbers(rows + k * CHUNK));
-    return moved;
-}
+    CUDA_CALLABLE void store(Real* rows) const {
+        for (int k = 0; k < POSE_ROWS; ++k) put(rows + k * CHUNK, moved ? now[k] : numbers(rows + k * CHUNK));
+    }
+};
 
 // Computes the tensors of the rows from ``row`` on whose pairs have moved.
 template <class Pairs> CUDA_CALLABLE inline void tabulate(const Pairs& a, int row) {
-    const PairReader<Pairs> reader(a);
-    int counts[WIDTH];
-    const Cells own = reader.own(row, counts);
-    const int slots = largest_count(counts);
-    if (slots == 0) return;
-    const Boxes box = reader.boxes(own);
-    const Vector x = reader.position(own);
-    Number overlap = box.size * Real(0);
-    for (int slot = share(); slot < slots; slot += SHARES) {
-        const Cells other = reader.candidates(own, counts, slot);
-        const Boxes other_box = reader.boxes(other);
-        const Vector apart = reader.position(other) - x;
-        const Mask listed = mask_of(indices(own.at) != indices(other.at));
-        const RelativePose pose = relative_pose(apart, box, other_box);
-        const Mask induced = listed && reader.is_inducible(other);
-        overlap += induced ? overlap_share(box, other_box, pose) : overlap * Real(0);
-        const Mask moved = store_pose(slot_at(a.pose.data, reader.capacity, POSE_ROWS, slot, row), pose, box.size);
-        if (!any(moved)) continue;
-        const BoxPair pair = box_pair(box, other_box, pose, listed, precedes(own, other));
+    const Rows<Pairs> rows(a, row);
+    if (rows.slots == 0) return;
+    const Boxes box = rows.boxes(rows.own);
+    const Number zero = box.size * Real(0);
+    Number overlap = zero;
+    for_candidates(rows.slots, rows.close_slots(), [&](int slot, Points points) {
+        const Cells other = rows.candidates(slot);
+        const Boxes other_box = rows.boxes(other);
+        const RelativePose pose = relative_pose(box, other_box);
+        const Mask induced = rows.listed(other) && other_box.inducible;
+        if (points.first == 0) overlap += induced ? overlap_share(box, other_box, pose) : zero;
+        Real* const stored = slot_at(a.pose.data, rows.capacity, POSE_ROWS, slot, row);
+        const PoseRows change(stored, pose, box.size);
+        if (!any(change.moved)) return;
+        const BoxPair pair = rows.pair(box, other, other_box, pose);
         const Mask near = pair.window.value > Real(0);
         const Number factor = pair.window.value * pair.unit * pair.unit * pair.unit;
         PairMatrices matrices;
-        if (any(near)) matrices = pair_matrices(pair);
-        put_moved(slot_at(a.matrix.data, reader.capacity, MATRIX_ROWS, slot, row), matrices.means, 9, factor, moved,
-                  near);
-        if (slot >= a.close_capacity) continue;
-        Real* const detail = slot_at(a.detail.data, a.close_capacity, DETAIL_ROWS, slot, row);
-        put_moved(detail, matrices.of_differences, 9, factor, moved, near);
-        put_moved(detail + 9 * CHUNK, matrices.at_differences, 9, factor, moved, near);
-        put_moved(detail + 18 * CHUNK, matrices.differences, 9, factor, moved, near);
-    }
-    const Number zero = overlap * Real(0),
-                 within = (group_sum(overlap) - OVERLAP_BEGIN) / (OVERLAP_END - OVERLAP_BEGIN);
+        if (any(near)) matrices = pair_matrices(pair, points);
+        auto write = [&](Real* out, const Number* values) {
+            put_moved(out, values, points, factor, change.moved, near);
+        };
+        write(slot_at(a.matrix.data, rows.capacity, MATRIX_ROWS, slot, row), matrices.means);
+        if (slot < a.close_capacity) {
+            Real* const detail = slot_at(a.detail.data, a.close_capacity, DETAIL_ROWS, slot, row);
+            write(detail, matrices.of_differences);
+            write(detail + 9 * CHUNK, matrices.at_differences);
+            write(detail + 18 * CHUNK, matrices.differences);
+        }
+        if (points.first == 0) change.store(stored); // after the other threads have read it
+    });
+    const Number within = (group_sum(overlap) - OVERLAP_BEGIN) / (OVERLAP_END - OVERLAP_BEGIN);
     overlap = smaller(larger(within, zero), zero + 1);
     if (share() == 0) put(a.overlap_factor.data + row, OVERLAP_DEMAGNETIZATION * overlap / box.volume);
 }
@@ -257,22 +306,18 @@ CUDA_CALLABLE inline void add_to_cells(Real* array, const Cells& cells, const in
 
 // Adds the corrections to the field of the rows' cells.
 template <class Pairs> CUDA_CALLABLE inline void add_field(const Pairs& a, int row) {
-    const PairReader<Pairs> reader(a);
-    int counts[WIDTH];
-    const Cells own = reader.own(row, counts);
-    const int slots = largest_count(counts);
-    if (slots == 0) return;
-    const Rotation<Number> frame = rotation_of<Number>(reader.boxes(own).q);
+    const Rows<Pairs> rows(a, row);
+    if (rows.slots == 0) return;
+    const Rotation<Number> frame = rotation_of<Number>(rows.boxes(rows.own).q);
     const Number zero = frame.rows[0][0] * Real(0);
     const Real *const means = (const Real*)a.means.data, *const differences = (const Real*)a.differences.data;
-    int close_counts[WIDTH];
-    for (int l = 0; l < WIDTH; ++l) close_counts[l] = counts[l] == 0 ? 0 : a.close_count.data[own.at[l]];
-    const int close = largest_count(close_counts) < a.close_capacity ? largest_count(close_counts) : a.close_capacity;
+    const int may_be_close = a.close_capacity > 0 ? rows.close_slots() : 0;
+    const int close = may_be_close < a.close_capacity ? may_be_close : a.close_capacity;
     Vector h = {zero, zero, zero}, g = h;
-    for (int slot = share(); slot < slots; slot += SHARES) {
-        const Cells other = reader.candidates(own, counts, slot);
+    for (int slot = share(); slot < rows.slots; slot += SHARES) {
+        const Cells other = rows.candidates(slot);
         const Vector m = vectors_of(means, other);
-        h += matrix_times(slot_at(a.matrix.data, reader.capacity, MATRIX_ROWS, slot, row), m);
+        h += matrix_times(slot_at(a.matrix.data, rows.capacity, MATRIX_ROWS, slot, row), m);
         if (slot >= close) continue;
         const Real* const detail = slot_at(a.detail.data, a.close_capacity, DETAIL_ROWS, slot, row);
         const Vector d = vectors_of(differences, other);
@@ -280,49 +325,44 @@ template <class Pairs> CUDA_CALLABLE inline void add_field(const Pairs& a, int r
         g += matrix_times(detail + 9 * CHUNK, m) + matrix_times(detail + 18 * CHUNK, d);
     }
     const Number overlap_factor = numbers(a.overlap_factor.data + row);
-    h = group_sums(h) - overlap_factor * vectors_of(means, own);
+    h = group_sums(h) - overlap_factor * vectors_of(means, rows.own);
     g = group_sums(g);
-    for (int l = 0; l < WIDTH; ++l) counts[l] = a.inducible.data[own.at[l]] ? counts[l] : 0;
-    add_to_cells((Real*)a.h.data, own, counts, to_world(frame, h), 1);
-    add_to_cells((Real*)a.difference_field.data, own, counts, g, 1);
+    int counts[WIDTH];
+    for (int l = 0; l < WIDTH; ++l) counts[l] = a.inducible.data[rows.own.at[l]] ? rows.counts[l] : 0;
+    add_to_cells((Real*)a.h.data, rows.own, counts, to_world(frame, h), 1);
+    add_to_cells((Real*)a.difference_field.data, rows.own, counts, g, 1);
 }
 
 // Adds forces [N] and torques [N·m] to the rows' cells.
 template <class Pairs> CUDA_CALLABLE inline void add_force(const Pairs& a, int row) {
-    const PairReader<Pairs> reader(a);
-    int counts[WIDTH];
-    const Cells own = reader.own(row, counts);
-    const int slots = largest_count(counts);
-    if (slots == 0) return;
-    const Boxes box = reader.boxes(own);
-    const Rotation<Number> frame = rotation_of<Number>(box.q);
-    const Vector x = reader.position(own), m = to_body(frame, reader.moment(own));
-    const Real* const differences = (const Real*)a.differences.data;
-    const Vector difference = vectors_of(differences, own);
+    const Rows<Pairs> rows(a, row);
+    if (rows.slots == 0) return;
+    const Boxes box = rows.boxes(rows.own);
+    const Real *const means = (const Real*)a.means.data, *const differences = (const Real*)a.differences.data;
+    const Vector m = vectors_of(means, rows.own), difference = vectors_of(differences, rows.own);
     const Number zero = box.size * Real(0);
     Vector force = {zero, zero, zero}, torque = force;
-    for (int slot = share(); slot < slots; slot += SHARES) {
-        const Cells other = reader.candidates(own, counts, slot);
-        const Boxes other_box = reader.boxes(other);
-        const RelativePose pose = relative_pose(reader.position(other) - x, box, other_box);
-        const Mask listed = mask_of(indices(own.at) != indices(other.at));
-        const BoxPair pair = box_pair(box, other_box, pose, listed, precedes(own, other));
+    for_candidates(rows.slots, rows.close_slots(), [&](int slot, Points points) {
+        const Cells other = rows.candidates(slot);
+        const Boxes other_box = rows.boxes(other);
+        const BoxPair pair = rows.pair(box, other, other_box, relative_pose(box, other_box));
         const Mask near = pair.window.value > Real(0);
-        if (!any(near)) continue;
+        if (!any(near)) return;
         const Number cube = pair.unit * pair.unit * pair.unit;
-        const PairMoments moments = {m, cube * to_body(frame, reader.moment(other)), difference,
+        const PairMoments moments = {m, cube * to_world(pair.rotation, vectors_of(means, other)), difference,
                                      cube * vectors_of(differences, other)};
-        const Wrench wrench = pair_wrench(pair, moments);
+        const Wrench wrench = pair_wrench(pair, moments, points);
         add_where(near, force, pair.unit * wrench.force);
         add_where(near, torque, wrench.torque);
-    }
+    });
     int moved[WIDTH], turned[WIDTH];
     for (int l = 0; l < WIDTH; ++l) {
-        moved[l] = a.movable.data[own.at[l]] ? counts[l] : 0;
-        turned[l] = a.rotatable.data[own.at[l]] ? moved[l] : 0;
+        moved[l] = a.movable.data[rows.own.at[l]] ? rows.counts[l] : 0;
+        turned[l] = a.rotatable.data[rows.own.at[l]] ? moved[l] : 0;
     }
-    add_to_cells((Real*)a.forces.data, own, moved, to_world(frame, group_sums(force)), MU0);
-    add_to_cells((Real*)a.torques.data, own, turned, to_world(frame, group_sums(torque)), MU0);
+    const Rotation<Number> frame = rotation_of<Number>(box.q);
+    add_to_cells((Real*)a.forces.data, rows.own, moved, to_world(frame, group_sums(force)), MU0);
+    add_to_cells((Real*)a.torques.data, rows.own, turned, to_world(frame, group_sums(torque)), MU0);
 }
 
 // Writes the moment of moment i if it is a ball.
@@ -335,8 +375,8 @@ template <class Pairs> CUDA_CALLABLE inline void take_ball(const Pairs& a, int i
 // The passes that arrange rows after a search.
 template <class Pairs> CUDA_CALLABLE inline void arrange_rows(const Pairs& a, int pass, int i) {
     if (a.searching.data[0] == 0) return;
-    if (pass == CLEAR && i < BINS) a.bin_end.data[i] = 0;
-    if (pass == ARRANGE && i == 0) arrange(a);
+    if (pass == CLEAR && i < BINS && share() == 0) a.bin_end.data[i] = 0;
+    if (pass == ARRANGE && i == 0 && share() == 0) arrange(a);
     if (i >= a.group.shape[0]) return;
     if (pass == SELECT) select(a, i);
     if (pass == ASSIGN) assign(a, i);
@@ -350,10 +390,11 @@ template <class Pairs> CUDA_CALLABLE inline void make_cell_pair_pass(const Pairs
         else add_force(a, i);
         return;
     }
-    for (int l = 0; l < WIDTH && share() == 0; ++l)
-        if (pass == LOCATE) locate(a, i + l);
-        else if (pass == TAKE_BALLS) take_ball(a, i + l);
-        else arrange_rows(a, pass, i + l);
+    for (int l = 0; l < WIDTH; ++l)
+        if (pass != LOCATE && pass != TAKE_BALLS) arrange_rows(a, pass, i + l);
+        else if (share() != 0) return;
+        else if (pass == LOCATE) locate(a, i + l);
+        else take_ball(a, i + l);
 }
 
 template <class Word, class Pairs>

@@ -18,7 +18,7 @@ import warp as wp
 
 from warpmag.kernels.pairs import neighbors
 from warpmag.kernels.pairs.wrench import MU0
-from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
+from warpmag.kernels.shared.native import CHUNK, LINE, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
@@ -56,6 +56,8 @@ LOCATE, CLEAR, SELECT, ARRANGE, ASSIGN, TABULATE, TAKE_BALLS, ADD_FIELD, ADD_FOR
 """The passes, in order; as in ``cell_pairs.h``."""
 _MATRIX_ROWS, _DETAIL_ROWS, _POSE_ROWS = 9, 27, 7
 """Numbers of the matrices of a pair and of a relative pose; as in ``cell_pairs.h``."""
+_KINDS = 5
+"""Kinds of candidates; as in ``cell_pairs.h``."""
 _BINS = 256
 """Bins of rows by their numbers of candidates; as in ``cell_pairs.h``."""
 CELLS_PER_THREAD = 100
@@ -89,10 +91,9 @@ def cell_pairs_type(dtype):
         forces: wp.array[vec3]  # [N], shape [n]
         torques: wp.array[vec3]  # about the moments' positions [N·m], shape [n]
         crowded: wp.array[int]  # 1 if a cell had more candidates than its list holds, shape [1]
-        close_capacity: int  # close candidates of a cell with details
-        close_count: wp.array[int]  # number of close candidates, which come first, shape [n]
+        close_capacity: int  # close candidates of a cell with details; 0 if no body has linear cells
         # Work:
-        frame: wp.array[quaternion]  # from the frame of each body's grid to the world, and the identity, shape [b + 1]
+        box: wp.array[dtype]  # line of each moment, as in ``locate``, shape [16 n]
         candidate: wp.array2d[int]  # moments that are or may become near, shape [n, capacity]
         candidate_count: wp.array[int]  # their number, which may exceed the capacity, shape [n]
         found_at: wp.array[vec3]  # positions at the last search [m], shape [n]
@@ -101,7 +102,9 @@ def cell_pairs_type(dtype):
         rows: wp.array[int]  # number of rows, shape [1]
         bin: wp.array[int]  # bin of each moment by its numbers of candidates, −1 for no row, shape [n]
         bin_end: wp.array[int]  # end of each bin's rows, shape [BINS]
+        kinds: wp.array[int]  # numbers of each kind of candidates, shape [n, KINDS], flat
         cell: wp.array[int]  # cell of each row, shape [c padded]
+        column: wp.array[int]  # candidates of each row, shape [c padded / CHUNK, capacity, CHUNK], flat
         pose: wp.array[dtype]  # relative pose of each tensor, shape [c padded / CHUNK, capacity, 7, CHUNK], flat
         overlap_factor: wp.array[dtype]  # demagnetizing factor of overlaps over the volume [1/m³], shape [c padded]
         matrix: wp.array[dtype]  # T_ij of means [1/m³], shape [c padded / CHUNK, capacity, 9, CHUNK], flat
@@ -244,22 +247,20 @@ class CellPairs:
         a.packed, a.h, a.forces, a.torques = packed.packed, h, forces, torques
         a.means, a.differences, a.difference_field = cells.means, cells.differences, cells.difference_field
         a.candidate, a.candidate_count, a.found_at = lists.neighbor, lists.count, lists.found_at
-        a.moved, a.searching, a.frame = (
-            lists.moved,
-            lists.searching,
-            put(np.tile([0.0, 0.0, 0.0, 1.0], (len(bodies) + 1, 1)), quaternion),
-        )
-        self.crowded = a.crowded = zeros(1)
+        a.moved, a.searching, a.box = lists.moved, lists.searching, zeros(LINE * n, kind=dtype)
+        self.crowded, a.kinds = zeros(1), zeros(_KINDS * n)
+        a.crowded = self.crowded
         a.rows, a.bin, a.bin_end = zeros(1), zeros(n), zeros(_BINS)
         a.cell, a.overlap_factor = zeros(padded), zeros(padded, kind=dtype)
         a.pose = _large_zeros(padded * capacity * _POSE_ROWS, dtype, device)
-        a.close_capacity, a.close_count = min(capacity, _LONGEST_CLOSE), zeros(n)
+        a.column = _large_zeros(padded * capacity, wp.int32, device)
+        a.close_capacity = min(capacity, _LONGEST_CLOSE) if a.linear.numpy().any() else 0
         a.matrix = _large_zeros(padded * capacity * _MATRIX_ROWS, dtype, device)
         a.detail = _large_zeros(padded * a.close_capacity * _DETAIL_ROWS, dtype, device)
         self._locate, self._tabulate = self._record(LOCATE, LOCATE), self._record(CLEAR, TABULATE)
         self._field, self._force = (
             self._record(TAKE_BALLS if len(taken) else ADD_FIELD, ADD_FIELD),
-            self._record(ADD_FORCE, ADD_FORCE),
+            [*(self._record(TAKE_BALLS, TAKE_BALLS) if len(taken) else []), *self._record(ADD_FORCE, ADD_FORCE)],
         )
 
     def for_all_moments(self, cells, packed, h) -> "CellPairs":
@@ -307,5 +308,5 @@ class CellPairs:
 
     def persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays that the next search and the next evaluation read, by name."""
-        kept = ("rows", "cell", "pose", "matrix", "detail", "overlap_factor", "crowded", "close_count")
+        kept = ("rows", "cell", "column", "pose", "matrix", "detail", "overlap_factor", "crowded", "kinds")
         return neighbors.persistent_lists(self._lists) | {name: getattr(self.arrays, name) for name in kept}

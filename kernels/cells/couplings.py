@@ -71,6 +71,11 @@ def _table(start, other, tensor):
     return slots, others, tensors
 
 
+def padded_vectors(count: int, dtype, device) -> wp.array:
+    """Return zero vectors in memory that has one vector more, because reading four numbers at a time is faster."""
+    return wp.zeros(count + 1, dtype=dtype, device=device)[:count]
+
+
 @cache
 def _kernel(dtype, group: int):
     call = "add_couplings(thread, first, last, threads, team.data, arrays)"
@@ -106,7 +111,8 @@ class CellCouplings:
         c.moments, c.h = moments, h
         self._lay_out(bodies, dtype, h.device)
         self.chunks = c.chunk
-        c.means, c.differences, c.difference_field = (wp.zeros_like(moments) for _ in range(3))
+        c.difference_field = wp.zeros_like(moments)
+        c.means, c.differences = (padded_vectors(len(moments), moments.dtype, h.device) for _ in range(2))
         self.means, self.differences = c.means, c.differences
         self.difference_field = c.difference_field
         self.rotations, self.entries = c.rotation, sum(len(coupling.other) for _, coupling in bodies)
