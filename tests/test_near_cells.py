@@ -14,7 +14,7 @@ from bench import iron
 from bench.reference.iron_bodies import SETUPS, Body, Setup, load
 from bench.reference.oracle import MU0
 from tests.cell_bodies import demagnetizing_matrix
-from warpmag.shapes import demagnetization, lattice
+from warpmag.shapes import cylinder_potential, demagnetization, lattice
 from warpmag.shapes.face_charges import face_response
 from warpmag.shapes.linear_cells import with_slopes
 
@@ -23,10 +23,46 @@ PLATE = Body("box", (0.03, 0.03, 0.0015), (0.0, 0.0, -0.0015))
 TURNED = replace(PLATE, turn=0.3, center=(0.0, 0.0, -0.0055))  # 0.9 mm below the edge of the magnet
 
 
-def with_magnet(plate: Body, shift, gap: float) -> Setup:
+ALONG, ASKEW = (0.0, 0.0, REMANENCE / MU0), (0.7 * REMANENCE / MU0, 0.0, -0.7 * REMANENCE / MU0)
+
+
+def with_magnet(plate: Body, shift, gap: float, magnetization=ALONG) -> Setup:
     """Return a plate below a magnet of 20 × 5 mm with a shift [m] along x and y, and a gap [m] above z = 0."""
     center = (*shift, gap + 0.0025)
-    return Setup((plate, Body("cylinder", (0.01, 0.0025), center, 0.0, magnetization=(0.0, 0.0, REMANENCE / MU0))))
+    return Setup((plate, Body("cylinder", (0.01, 0.0025), center, 0.0, magnetization=magnetization)))
+
+
+@pytest.mark.parametrize("magnetization", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0)], ids=["along", "across"])
+@pytest.mark.parametrize(("radius", "half_height"), [(0.01, 0.0025), (1e-3, 5e-5), (0.002, 0.02)])
+def test_tables_interpolate_the_field_around_cylinders(radius, half_height, magnetization):
+    """A table has 8 nodes per factor e of the distance from the rim; cubics then have a slope to 2e-4."""
+    table = cylinder_potential.potential_table(radius, half_height)
+    inner, below, rhos, zs = table[4:8].astype(int)
+    nodes = table[10:].reshape(2, rhos, zs, 4)[0 if magnetization[2] else 1]
+    cells = np.stack([nodes[i : rhos - 1 + i, j : zs - 1 + j] for i in range(2) for j in range(2)])
+    values, slopes = np.array([0.5, 0.5]), np.array([0.125, -0.125])  # weights at the middle of a cell
+    by_values, by_slopes = np.array([-1.5, 1.5]), np.array([-0.25, -0.25])
+    rho_weights = {False: (values, slopes), True: (by_values, by_slopes)}
+    fields = []
+    for by_rho, by_z in ((True, False), (False, True)):
+        (a, b), (c, d) = rho_weights[by_rho], rho_weights[by_z]
+        weights = np.stack([np.outer(p, q).ravel() for p, q in ((a, c), (b, c), (a, d), (b, d))], axis=1)
+        fields.append(-np.einsum("nk,nijk->ij", weights, cells))
+    middles, per_node = [], []
+    for edge, s, before, count in zip(table[:2], table[2:4], (inner, below), (rhos, zs), strict=True):
+        folds = (np.arange(count - 1) + 0.5 - before) / table[8]
+        middles.append(edge + np.sign(folds) * s * np.expm1(abs(folds)))
+        per_node.append(s * np.exp(abs(folds)) / table[8])
+    x, z = np.meshgrid(*middles, indexing="ij")
+    points = np.stack([x, np.zeros_like(x), z], axis=-1).reshape(-1, 3)
+    exact = magpylib.magnet.Cylinder(
+        magnetization=magnetization, dimension=(2.0 * radius, 2.0 * half_height)
+    ).getH(points).reshape(*x.shape, 3)  # fmt: skip
+    error = np.stack([fields[0] / per_node[0][:, None], fields[1] / per_node[1]], axis=-1) - exact[..., [0, 2]]
+    error = np.linalg.norm(error, axis=-1) / np.linalg.norm(exact, axis=-1)
+    error[:inner, :below] = 0.0  # the inside
+    error[inner - 1 : inner + 1, below - 1 : below + 1] = 0.0  # around the rim
+    assert error.max() < 2e-3 and np.sqrt((error**2).mean()) < 3e-4
 
 
 def test_field_of_a_near_magnet_is_its_average_over_a_cell(device):
@@ -60,9 +96,9 @@ def test_field_of_a_near_magnet_is_its_average_over_a_cell(device):
     np.testing.assert_allclose(field[near], expected[near], atol=0.02 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("plate", [PLATE, TURNED], ids=["flat", "turned"])
+@pytest.mark.parametrize(("plate", "magnetization"), [(PLATE, ALONG), (TURNED, ASKEW)], ids=["flat", "turned"])
 @pytest.mark.parametrize("gap", [1e-4, 3.7e-3], ids=["close", "fading"])
-def test_force_is_the_derivative_of_the_energy(plate, gap, device):
+def test_force_is_the_derivative_of_the_energy(plate, magnetization, gap, device):
     """At 3.7 mm the averages fade. Rounding of the energy in float32 over steps of 0.02 mm is 1 % of the force."""
     step = 2e-5
     for axis in (0, 2):
@@ -70,9 +106,11 @@ def test_force_is_the_derivative_of_the_energy(plate, gap, device):
         for sign in (-1.0, 1.0):
             shift = np.array([0.0013, 0.0007, gap])
             shift[axis] += sign * step
-            _, _, magnetics = iron.model_forces(with_magnet(plate, shift[:2], shift[2]), 0, device, "dipole")
+            setup = with_magnet(plate, shift[:2], shift[2], magnetization)
+            _, _, magnetics = iron.model_forces(setup, 0, device, "dipole")
             energies.append(float(magnetics.energy()[0]))
-        forces, _, _ = iron.model_forces(with_magnet(plate, (0.0013, 0.0007), gap), 0, device, "dipole")
+        setup = with_magnet(plate, (0.0013, 0.0007), gap, magnetization)
+        forces, _, _ = iron.model_forces(setup, 0, device, "dipole")
         expected = -(energies[1] - energies[0]) / (2.0 * step)
         assert abs(forces[1, axis] - expected) < 0.01 * np.linalg.norm(forces[1])
         np.testing.assert_allclose(forces.sum(axis=0), 0.0, atol=2e-6 * np.abs(forces).max())

@@ -35,6 +35,7 @@ none of these kernels is launched.
 | `field_map.h` | field on a regular grid |
 | `solids.h`, `body_pairs.h` | permanent bodies, their lattices; forces between two bodies |
 | `polyhedron.h` | field, gradient and potentials of a uniformly magnetized polyhedron |
+| `cylinder.h` | potential and field of a uniformly magnetized cylinder, from a table |
 
 A new kind of coil or map needs a header with its field, an include and a case in ``sources.h``, and a name in
 ``sources.SourceKind``.

@@ -260,7 +260,7 @@ class AppliedForces(AppliedField):
         """
         sources, cells = self.sources, self.arrays.cells
         ranges, movable = sources.bodies_of(self._worlds), self.movable.numpy()
-        near_cells.lay_out(cells, bodies, rotations, ranges, movable, sources.dtype, self.device)
+        near_cells.lay_out(cells, bodies, rotations, sources.solids, ranges, movable, sources.dtype, self.device)
         cells.forces, cells.torques = forces, torques
         self.cell_count = cells.cell.shape[0]
         self._lay_out_rows(self._worlds[cells.cell.numpy()[:, 0]])

@@ -10,6 +10,7 @@
 // energy at constant permeability of the cell. Takes CELL_REACH_LOW, CELL_REACH_HIGH, STEEP_REACH_LOW and
 // STEEP_REACH_HIGH from Python. ``Arrays`` is the struct of sources.py.
 #pragma once
+#include "applied/cylinder.h"
 #include "applied/target_field.h"
 
 namespace warpmag {
@@ -125,9 +126,19 @@ CUDA_CALLABLE inline NearPoints near_points(const PermanentBody& body, Vector x)
     points.charge = points.height < 0 ? dot(broadcast(body.m), points.normal) : zero;
     return points;
 }
-// Potential and field of a body. Where contacts let an iron face sink into a magnet they are those of the outside, as
-// if the magnet's face were in front of the points: the pull does not turn into a push.
-CUDA_CALLABLE inline PotentialField outer_field(const PermanentBody& body, Vector x) {
+// Table of a body's cylinder; null for other shapes.
+template <class Arrays> CUDA_CALLABLE inline const Real* cylinder_of(const Arrays& arrays, const PermanentBody& body) {
+    const int first = arrays.cells.cylinder.data[body.shape];
+    return first < 0 ? nullptr : arrays.cells.cylinders.data + first;
+}
+// Potential and field of a body, from the table of its cylinder unless null. Where contacts let an iron face sink into
+// a magnet they are those of the outside, as if the magnet's face were in front of the points: the pull does not turn
+// into a push.
+CUDA_CALLABLE inline PotentialField outer_field(const PermanentBody& body, const Real* cylinder, Vector x) {
+    if (cylinder != nullptr) {
+        const PotentialField f = potential_field_of(cylinder_at(cylinder), body.m, body.frame.point_to_body(x));
+        return {f.phi, body.frame.to_world(f.h)};
+    }
     const NearPoints points = near_points(body, x);
     const PotentialField f = potential_field_of(body.solid, body.m, points.at);
     return {f.phi - points.charge * points.height, body.frame.to_world(f.h + points.charge * points.normal)};
@@ -149,11 +160,12 @@ CUDA_CALLABLE inline TargetField center_field(const Cell& cell, const PermanentB
 }
 
 // Half the difference of a body's field between the halves of a cell along its axes, of the components along them.
-CUDA_CALLABLE inline Real3 coarse_differences(const Cell& cell, const Real* units, const PermanentBody& body) {
+CUDA_CALLABLE inline Real3 coarse_differences(const Cell& cell, const Real* units, const PermanentBody& body,
+                                              const Real* cylinder) {
     Vector sums = zero_target_field().h;
     const PointRange range = coarse_points();
     for (int k = range.first + WIDTH * share(); k < range.last; k += WIDTH * SHARES)
-        cell.add_mean_field(units, 6, k, range.weight, outer_field(body, cell.points(units, k)).phi, sums);
+        cell.add_mean_field(units, 6, k, range.weight, outer_field(body, cylinder, cell.points(units, k)).phi, sums);
     return total_of(sums);
 }
 // Replaces the fields of near bodies at the center of cell c by their averages, and writes the differences of the field
@@ -170,14 +182,15 @@ template <class Arrays> CUDA_CALLABLE inline void average_over_cell(const Arrays
         const PermanentBody body = body_at(arrays, b);
         const CellFades fade = cell_fades(cell, body);
         const bool acts = body.label != cell.label;
+        const Real* const cylinder = cylinder_of(arrays, body);
         if (fade.coarse.weight > 0) {
-            steepness += fade.coarse.weight * coarse_differences(cell, units, body);
+            steepness += fade.coarse.weight * coarse_differences(cell, units, body, cylinder);
             if (acts && nearness == FAR_CELL) nearness = STEEP_CELL;
         }
         if (fade.fine.weight == 0) continue;
         Vector means = zero_target_field().h, differences = means; // along the axes of the grid
         for (int k = WIDTH * share(); k < range.last; k += WIDTH * SHARES) {
-            const Number phi = outer_field(body, cell.points(units, k)).phi;
+            const Number phi = outer_field(body, cylinder, cell.points(units, k)).phi;
             cell.add_mean_field(units, 3, k, range.weight, phi, means);
             cell.add_mean_field(units, 6, k, range.weight, phi, differences);
             if (acts && k < OUTER_POINTS)
@@ -267,12 +280,13 @@ CUDA_CALLABLE inline Real3 moment_differences(const Arrays& arrays, const Cell& 
     return {d[0], d[1], d[2]};
 }
 // Wrench/μ0 of a body on the charges of a cell by its moment, differences and response, at fine or coarse points.
-CUDA_CALLABLE inline Wrench wrench_on_charges(const Cell& cell, const PermanentBody& body, const Real* units,
-                                              PointRange range, Real3 m, Real3 difference, const Real* potential) {
+CUDA_CALLABLE inline Wrench wrench_on_charges(const Cell& cell, const PermanentBody& body, const Real* cylinder,
+                                              const Real* units, PointRange range, Real3 m, Real3 difference,
+                                              const Real* potential) {
     Wrench wrench = zero_wrench();
     for (int k = range.first + WIDTH * share(); k < range.last; k += WIDTH * SHARES) {
         const Vector x = cell.points(units, k);
-        const PotentialField at_points = outer_field(body, x);
+        const PotentialField at_points = outer_field(body, cylinder, x);
         Number charge =
             cell.charges(units, 3, k, range.weight, m) + cell.charges(units, 6, k, range.weight, difference);
         if (potential != nullptr && k < OUTER_POINTS && cell.is_outer(k / FACE_POINTS))
@@ -291,6 +305,7 @@ CUDA_CALLABLE inline void add_cell_wrench(const Arrays& arrays, const Cell& cell
     const CellFades fade = cell_fades(cell, body);
     if ((fade.fine.weight == 0 && fade.coarse.weight == 0) || body.label == cell.label) return;
     const Real* const units = arrays.cells.point.data;
+    const Real* const cylinder = cylinder_of(arrays, body);
     const Real3 m = effective_at(arrays.effective.data, arrays.effective.strides[0] / sizeof(Real), cell.moment);
     const Real3 difference = moment_differences(arrays, cell, c, m);
     auto add = [&](const SourceFade& by, Real3 f, Real3 t, Real energy) {
@@ -298,14 +313,15 @@ CUDA_CALLABLE inline void add_cell_wrench(const Arrays& arrays, const Cell& cell
         torque += by.weight * t;
     };
     if (fade.coarse.weight > 0) {
-        const Wrench w = wrench_on_charges(cell, body, units, coarse_points(), {0, 0, 0}, difference, nullptr);
+        const Wrench w =
+            wrench_on_charges(cell, body, cylinder, units, coarse_points(), {0, 0, 0}, difference, nullptr);
         add(fade.coarse, total_of(w.force), total_of(w.torque), total_of(w.energy));
     }
     if (fade.fine.weight == 0) return;
     const Real3 along = {dot(m, cell.axes[0]), dot(m, cell.axes[1]), dot(m, cell.axes[2])};
     const Real* const potential = arrays.cells.potential.data + OUTER_POINTS * (size_t)c;
     const Real3 responding = along - response_moment(cell, potential, units); // potentials lack the average field
-    const Wrench w = wrench_on_charges(cell, body, units, fine_points(), responding, difference, potential);
+    const Wrench w = wrench_on_charges(cell, body, cylinder, units, fine_points(), responding, difference, potential);
     const TargetField at_center = center_field(cell, body);
     const Real3 h = first_lane(at_center.h), f = first_lane(gradient_dot(at_center, broadcast(m)));
     add(fade.fine, total_of(w.force) - f, total_of(w.torque) - cross(m, h), total_of(w.energy) + dot(m, h));

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from warpmag.kernels.applied.solids import of_each_shape
 from warpmag.kernels.material.curves import curve_slope, inverse_curve_ratio
 from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.reductions import most_blocks
@@ -54,6 +55,8 @@ def cell_arrays_type(dtype):
         # Tables:
         response: wp.array[dtype]  # R [m] of faces across x, y and z, shape [kinds, 3, FACE_POINTS, FACE_POINTS]
         point: wp.array[dtype]  # points of a cell and charges at them (:func:`unit_points`), shape [9, points]
+        cylinder: wp.array[int]  # first number in ``cylinders`` of each permanent shape, -1 for polyhedra
+        cylinders: wp.array[dtype]  # places and tables of cylinders (``cylinder.h``)
         # Moments, shape [n]:
         movable: wp.array[int]
         forces: wp.array[vec3]  # [N], added to
@@ -110,13 +113,14 @@ def _table(coupling, kind: int, scalar) -> dict[str, np.ndarray]:
     }
 
 
-def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solid_ranges, movable, dtype, device):
+def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solids, solid_ranges, movable, dtype, device):
     """Fill the struct ``arrays`` for bodies of cells; None stands for a body that takes no part.
 
     Args:
         arrays: The struct of :func:`cell_arrays_type`.
         bodies: The bodies, in the order of ``rotations``.
         rotations: Rotation from each body's frame to the world, Warp array, shape [bodies].
+        solids: The permanent bodies (``solids.SolidMagnet``).
         solid_ranges: Range of the permanent bodies in the world of each moment, shape [n, 2].
         movable: True for moments whose force is evaluated, shape [n].
         dtype: Warp scalar type.
@@ -145,6 +149,10 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solid_rang
     grids[numbers] = np.array([_axes(body.coupling.grid_rotation) for body in shapes])[kind]
     arrays.grid, arrays.rotation, arrays.point = put(grids, dtype), rotations, put(unit_points().ravel(), dtype)
     arrays.response = put(np.concatenate([body.response.ravel() for body in shapes]), dtype)
+    potentials = [solid.shape.potential_table() for solid in of_each_shape(solids).values()]
+    ends = np.cumsum([len(potential) for potential in potentials])
+    arrays.cylinder = put([end - len(p) if len(p) else -1 for end, p in zip(ends, potentials, strict=True)])
+    arrays.cylinders = put(np.concatenate(potentials), dtype)
     arrays.movable = put(movable)
     arrays.wrench = wp.empty((len(row), 6), dtype=dtype, device=device)
     arrays.near = wp.zeros(len(row), dtype=wp.int32, device=device)

@@ -60,9 +60,14 @@ class SolidMagnet:
         return [self.response or 1.0 / self.volume, *reaches, *self.shape.bounds]
 
 
+def of_each_shape(solids) -> dict[int, SolidMagnet]:
+    """Return a body of each shape by the identity of the shape, in the order of the table ``shape``."""
+    return {id(solid.shape): solid for solid in solids}
+
+
 def tables_of(solids, *, fine: bool = False) -> dict[str, np.ndarray]:
     """Return all tables of the bodies ``solids``, with more points on faces if ``fine``."""
-    shapes = {id(solid.shape): solid for solid in solids}
+    shapes = of_each_shape(solids)
     number = {key: k for k, key in enumerate(shapes)}
     rows, tables = _shape_tables(shapes.values(), fine)
     tables["shape"] = rows

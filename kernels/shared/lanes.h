@@ -46,6 +46,7 @@ CUDA_CALLABLE inline Four four_at(const Real* lines, int quarter, const int* j) 
 CUDA_CALLABLE inline Four own_four(const Real* lines, int quarter, int i) {
     return ((const Four*)lines)[4 * (size_t)i + quarter];
 }
+CUDA_CALLABLE inline Four collect_four(const Real* fours, Index j) { return ((const Four*)fours)[j]; }
 CUDA_CALLABLE inline void put_four(Real* lines, int quarter, int i, Four f) {
     ((Four*)lines)[4 * (size_t)i + quarter] = f;
 }
@@ -177,6 +178,9 @@ inline Four four_at(const Real* lines, int quarter, const int* j) {
 }
 inline Four own_four(const Real* lines, int quarter, int i) {
     return load_fours([=](int l) { return lines + LINE * (size_t)(i + l) + 4 * quarter; });
+}
+inline Four collect_four(const Real* fours, Index j) {
+    return load_fours([=](int l) { return fours + 4 * (size_t)j[l]; });
 }
 template <int FIRST> inline void put_quarters(Real* lines, Number row) {
     const Quarter q = __builtin_shufflevector(row, row, FIRST, FIRST + 1, FIRST + 2, FIRST + 3);

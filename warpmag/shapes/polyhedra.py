@@ -17,6 +17,8 @@ from functools import cache, cached_property
 
 import numpy as np
 
+from warpmag.shapes.cylinder_potential import potential_table
+
 CYLINDER_SIDES = 32
 """Number of sides of the prism that replaces a cylinder."""
 _LEAST_POINTS, _EDGE_POINTS, _FACE_POINTS, _FINE_FACE_POINTS = 4, 16, 8, 32
@@ -35,15 +37,37 @@ which falls off with the fourth power of the distance."""
 
 
 @dataclass(frozen=True)
+class Cylinder:
+    """A cylinder."""
+
+    radius: float  # [m]
+    half_height: float  # [m]
+    center: np.ndarray  # [m], shape [3]
+    axis: np.ndarray  # unit vector, shape [3]
+
+
+@dataclass(frozen=True)
 class Polyhedron:
     """A convex polyhedron."""
 
     corners: np.ndarray  # [m], shape [c, 3]
     faces: tuple[tuple[int, ...], ...]  # indices of each face's corners, counterclockwise seen from outside
+    cylinder: Cylinder | None = None  # the cylinder that it replaces
 
     def posed(self, position, rotation) -> "Polyhedron":
         """Return the polyhedron rotated by a matrix and then moved by ``position`` [m]."""
-        return Polyhedron(self.corners @ np.asarray(rotation).T + position, self.faces)
+        rotation, cylinder = np.asarray(rotation), self.cylinder
+        if cylinder is not None:
+            center, axis = rotation @ cylinder.center + position, rotation @ cylinder.axis
+            cylinder = replace(cylinder, center=center, axis=axis)
+        return Polyhedron(self.corners @ rotation.T + position, self.faces, cylinder)
+
+    def potential_table(self) -> np.ndarray:
+        """Return center and axis of the cylinder, and its table (``cylinder_potential``), flat; empty for others."""
+        if self.cylinder is None:
+            return np.zeros(0)
+        shape = self.cylinder
+        return np.concatenate([shape.center, shape.axis, potential_table(shape.radius, shape.half_height)])
 
     @cached_property
     def bounds(self) -> tuple[float, ...]:
@@ -130,7 +154,9 @@ def cylinder(radius: float, half_height: float) -> Polyhedron:
     step = 2.0 * np.pi / CYLINDER_SIDES
     angle = step * np.arange(CYLINDER_SIDES)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return _prism(radius * np.sqrt(step / np.sin(step)) * circle, half_height)
+    prism = _prism(radius * np.sqrt(step / np.sin(step)) * circle, half_height)
+    exact = Cylinder(float(radius), float(half_height), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    return replace(prism, cylinder=exact)
 
 
 def box_moments(half_extents) -> Moments:
