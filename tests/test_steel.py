@@ -4,6 +4,7 @@ The independent reference interpolates with SciPy's PCHIP and finds each ball's 
 """
 
 import math
+import os
 
 import newton
 import numpy as np
@@ -341,6 +342,9 @@ def test_bad_files_are_refused_by_name(tmp_path, text, message):
         MagnetizationCurve.from_csv(path)
     with pytest.raises(InputError, match=r"^none.csv: cannot be read"):
         MagnetizationCurve.from_csv(tmp_path / "none.csv")
+    os.mkfifo(tmp_path / "pipe.csv")
+    with pytest.raises(InputError, match=r"^pipe.csv: cannot be read \(not a regular file\)"):
+        MagnetizationCurve.from_csv(tmp_path / "pipe.csv")
 
 
 @pytest.mark.parametrize(

@@ -199,7 +199,7 @@ def test_slips_are_warnings_of_both(device, tmp_path, capsys):
     assert expected <= set(warnings)
     assert not any(foreign in one for one in warnings for foreign in ("wax:", "warpSceneAPI"))
     [mesh] = [one for one in warnings if one.startswith("/World/Open: mesh: not closed")]
-    assert "its approximation for collisions, convexHull, is magnetized in its place" in mesh
+    assert "convexHull, is magnetized in its place, and a density gives it the mass of the open mesh" in mesh
 
 
 def test_what_goes_together_is_no_slip(device, tmp_path, capsys):

@@ -193,6 +193,12 @@ def test_a_checkpoint_that_is_none_is_refused_in_one_line(tmp_path, stage):
         assert "\n" not in str(refused.value)
 
 
+def test_a_pipe_in_place_of_a_checkpoint_does_not_wait(tmp_path, stage):
+    os.mkfifo(tmp_path / "run.resume.npz")
+    with pytest.raises(InputError, match=r"run\.resume\.npz is not a regular file"):
+        CacheWriter(stage, tmp_path / "run.usda", PATHS, PATHS).resume()
+
+
 @pytest.fixture
 def begun(tmp_path, stage, monkeypatch):
     """The checkpoint of a run that was ended."""

@@ -5,6 +5,7 @@
     python -m tests.fuzz --count 100 --seed 7 --fresh       each command in a fresh interpreter
     python -m tests.fuzz --count 3000 --workers 14          fourteen processes at a time
     python -m tests.fuzz --seed 7 --only 1234               one stage, which is kept in the folder
+    python -m tests.fuzz --count 200 --runs                 files of interrupted runs, which go on
 
 Stages with problems are kept in the folder, beside ``verdicts.jsonl`` with a line about each stage. ``--resume`` goes
 on behind the lines that are there. Ends with 1 where there are problems. Everything runs on the CPU: a GPU does not
@@ -35,11 +36,13 @@ def main() -> int:
     parser.add_argument("--batch", type=int, default=1, help="stages of one process (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=1, help="processes at a time (default: %(default)s)")
     parser.add_argument("--resume", action="store_true", help="leave out the stages that have a line in the folder")
+    parser.add_argument("--runs", action="store_true", help="interrupted runs in place of stages")
     parser.add_argument("--fresh", action="store_true", help="a fresh interpreter for each command")
     parser.add_argument("-o", "--output", type=Path, default=Path("fuzz_out"), help="folder (default: %(default)s)")
     options = parser.parse_args()
 
     from .campaign import Campaign, in_fresh_process, in_process, warm_up  # noqa: PLC0415 - imports USD, which reads the environment
+    from .resumes import author_runs, judge_resume  # noqa: PLC0415
     from .sources import author, author_others  # noqa: PLC0415
 
     folder = options.output.absolute()
@@ -58,6 +61,8 @@ def main() -> int:
     print(f"kernels ready after {time.monotonic() - began:.0f} s", flush=True)
     if not options.fresh:
         warm_up(sources, in_process)
+    if options.runs:
+        campaign.sources, campaign.trial = author_runs(sources, folder / "runs"), judge_resume
     numbers = [options.only] if options.only is not None else range(options.first, options.first + options.count)
     verdicts = _earlier(folder / "verdicts.jsonl") if options.resume else []
     left = [number for number in numbers if number not in {verdict.number for verdict in verdicts}]

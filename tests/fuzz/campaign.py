@@ -175,7 +175,7 @@ def warm_up(stages: list[Path], command: Callable, together: int = 1) -> None:
 
 def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Callable, device: str = "cpu") -> Verdict:
     """Make a mutant, send it through ``check`` and ``run``, and look at what came of it."""
-    began = _cpu_seconds() - _kernels.seconds
+    began = cpu_seconds() - _kernels.seconds
     verdict = Verdict(number)
     place = folder / f"{number:05}"
     shutil.rmtree(place, ignore_errors=True)
@@ -191,13 +191,13 @@ def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Ca
         )
     if verdict.run == OK and "texture" in verdict.done:  # which a picture alone reads
         shown, _, stderr_of_render = command("render", str(path), "-o", str(place / "out.png"), *_SMALL, device)
-        verdict.problems += _talk("render", stderr_of_render)
-        if shown != OK and len(_messages(stderr_of_render)) != 1:
-            verdict.problems.append(f"render ends with {shown}: {_messages(stderr_of_render)}"[:300])
-    errors = [line[12:] for line in told if line.startswith("error ")] + _messages(stderr_of_check)
-    refusals = _messages(stderr_of_run)
+        verdict.problems += talk("render", stderr_of_render)
+        if shown != OK and len(messages(stderr_of_render)) != 1:
+            verdict.problems.append(f"render ends with {shown}: {messages(stderr_of_render)}"[:300])
+    errors = [line[12:] for line in told if line.startswith("error ")] + messages(stderr_of_check)
+    refusals = messages(stderr_of_run)
     verdict.line = refusals[-1] if refusals else ""
-    verdict.problems += [*_talk("check", stderr_of_check), *_talk("run", stderr_of_run)]
+    verdict.problems += [*talk("check", stderr_of_check), *talk("run", stderr_of_run)]
     verdict.problems += [f"reached {place}" for place in _reached.places]
     verdict.problems += _disagreements(verdict.check, errors, verdict.run, refusals)
     if verdict.run == BAD_INPUT and output.exists():
@@ -206,11 +206,11 @@ def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Ca
         verdict.problems.append(f"failed: {verdict.line}")
     if verdict.run == OK:
         verdict.problems += differences(path, output, simulations[-1] if simulations else None)
-    verdict.seconds = _cpu_seconds() - _kernels.seconds - began
+    verdict.seconds = cpu_seconds() - _kernels.seconds - began
     return verdict
 
 
-def _cpu_seconds() -> float:
+def cpu_seconds() -> float:
     """Return the CPU time of this process and of its children that have ended [s]."""
     return sum(os.times()[:4])
 
@@ -273,7 +273,7 @@ def _caught(descriptor: int) -> Iterator[list[str]]:
             text.append(file.read().decode(errors="replace"))
 
 
-def _messages(lines: list[str]) -> list[str]:
+def messages(lines: list[str]) -> list[str]:
     """Return the errors among lines on stderr."""
     return [
         line.removeprefix("warpmag: ")
@@ -282,15 +282,15 @@ def _messages(lines: list[str]) -> list[str]:
     ]
 
 
-def _talk(command: str, lines: list[str]) -> list[str]:
+def talk(command: str, lines: list[str]) -> list[str]:
     """Return what a command must not have written to stderr."""
     if any(line.startswith("Traceback") for line in lines):
         return [f"{command}: traceback: {lines[-1][:200]}"]
     # a warning erases the bar above it with blanks
     strange = [line for line in lines if line.strip() and not _EXPECTED.search(line)]
     found = [f"{command}: said {strange[0][:200]!r} and {len(strange) - 1} lines more"] if strange else []
-    if len(_messages(lines)) > 1:
-        found.append(f"{command}: {len(_messages(lines))} lines of errors")
+    if len(messages(lines)) > 1:
+        found.append(f"{command}: {len(messages(lines))} lines of errors")
     return found + [f"{command}: a line of {len(line)}" for line in lines if len(line) > _LONGEST_LINE]
 
 
@@ -319,6 +319,7 @@ class Campaign:
         workers: Workers at a time.
         fresh: Whether each command gets an interpreter of its own.
         keep: Whether mutants without problems are kept, too.
+        trial: Function that makes a mutant of the sources and returns its verdict.
     """
 
     seed: int
@@ -328,6 +329,7 @@ class Campaign:
     workers: int = 1
     fresh: bool = False
     keep: bool = False
+    trial: Callable[..., Verdict] = field(default_factory=lambda: judge)
 
     def verdicts(self, numbers: list[int]) -> Iterator[Verdict]:
         """Yield what became of each of the mutants, in the order in which they end."""
@@ -367,7 +369,7 @@ class Campaign:
             limit = int(time.process_time()) + CPU_SECONDS + KERNEL_SECONDS  # of this process alone
             resource.setrlimit(resource.RLIMIT_CPU, (limit, resource.RLIM_INFINITY))
             try:
-                verdict = judge(number, self.seed, self.folder, self.sources, command)
+                verdict = self.trial(number, self.seed, self.folder, self.sources, command)
                 if verdict.seconds > CPU_SECONDS and not self.fresh:  # starts of interpreters are no stage's fault
                     verdict.problems.append(f"took {verdict.seconds:.0f} s of CPU time")
             except BaseException:

@@ -11,6 +11,8 @@ from pathlib import Path
 
 from pxr import Gf, Sdf, Vt
 
+from .authoring import declare, define
+
 TEXTURES = (
     *("http://127.0.0.1:9/x.png", "HTTPS://127.0.0.1:9/x.png", "file:///dev/zero", "ftp:/x", " http://127.0.0.1:9/"),
     *("/dev/stdin", "/dev/zero", "/proc/self/mem", "./pipe.png", "./link.png", "./", "", "nothing.png", "<UDIM>.png"),
@@ -34,11 +36,11 @@ SCHEMAS = (
 def texture(layer, prims, chance) -> str:
     """Bind a material whose texture is an address, a device or nonsense, behind connections."""
     prim, number = layer.GetPrimAtPath(chance.choice(prims)), chance.randrange(1000)
-    material = _define(layer, f"/Looks{number}", "Material")
-    surface, picture = (_define(layer, f"/Looks{number}/{name}", "Shader") for name in ("Surface", "Picture"))
-    _attribute(surface, "info:id", "token").default = "UsdPreviewSurface"
-    _attribute(picture, "info:id", "token").default = chance.choice(("UsdUVTexture",) * 7 + ("ND_image_color3",))
-    _attribute(picture, "inputs:sourceColorSpace", "token").default = chance.choice(("raw", "raw", "sRGB"))
+    material = define(layer, f"/Looks{number}", "Material")
+    surface, picture = (define(layer, f"/Looks{number}/{name}", "Shader") for name in ("Surface", "Picture"))
+    declare(surface, "info:id", "token").default = "UsdPreviewSurface"
+    declare(picture, "info:id", "token").default = chance.choice(("UsdUVTexture",) * 7 + ("ND_image_color3",))
+    declare(picture, "inputs:sourceColorSpace", "token").default = chance.choice(("raw", "raw", "sRGB"))
     name, kind = chance.choice(TEXTURES), chance.choice(KINDS)
     folder = Path(layer.realPath).parent
     if not os.path.lexists(folder / "pipe.png"):
@@ -47,11 +49,11 @@ def texture(layer, prims, chance) -> str:
     links = _chain(layer, picture, f"/Looks{number}", kind, chance)
     _give(layer, links[-1], kind, name, chance)
     color = chance.choice(("diffuseColor",) * 8 + ("emissiveColor", "roughness"))
-    connected = _attribute(surface, f"inputs:{color}", "color3f")
+    connected = declare(surface, f"inputs:{color}", "color3f")
     connected.connectionPathList.explicitItems = [picture.path.AppendProperty("outputs:rgb")]
-    _attribute(picture, "outputs:rgb", "float3")
-    _attribute(surface, "outputs:surface", "token")
-    output = _attribute(material, "outputs:surface", "token")
+    declare(picture, "outputs:rgb", "float3")
+    declare(surface, "outputs:surface", "token")
+    output = declare(material, "outputs:surface", "token")
     output.connectionPathList.explicitItems = [surface.path.AppendProperty("outputs:surface")]
     binding = chance.choice(("material:binding", "material:binding", "material:binding:preview"))
     if chance.random() < 0.8:
@@ -74,7 +76,7 @@ def _make_mesh(prim) -> None:
         "primvars:st": ("texCoord2f[]", Vt.Vec2fArray([Gf.Vec2f(0.1 * k, 0.5) for k in range(12)])),
     }
     for name, (kind, value) in values.items():
-        _attribute(prim, name, kind).default = value
+        declare(prim, name, kind).default = value
     prim.attributes["primvars:st"].SetInfo("interpolation", "faceVarying")
     before = prim.GetInfo("apiSchemas").GetAppliedItems() if prim.HasInfo("apiSchemas") else []
     schemas = dict.fromkeys((*before, "PhysicsCollisionAPI", "MaterialBindingAPI"))
@@ -83,10 +85,10 @@ def _make_mesh(prim) -> None:
 
 def _chain(layer, picture, looks, kind, chance):
     """Return ``inputs:file`` of a shader and attributes that it is connected to, one behind the other."""
-    links = [_attribute(picture, "inputs:file", kind)]
+    links = [declare(picture, "inputs:file", kind)]
     for depth in range(chance.choice((0, 0, 1, 2, 3, 40))):
-        prim = _define(layer, f"{looks}/Values{depth}", chance.choice(("NodeGraph", "Shader", "Material", "", "Xform")))
-        links.append(_attribute(prim, chance.choice(("outputs:", "inputs:") * 4 + ("",)) + f"chosen{depth}", kind))
+        prim = define(layer, f"{looks}/Values{depth}", chance.choice(("NodeGraph", "Shader", "Material", "", "Xform")))
+        links.append(declare(prim, chance.choice(("outputs:", "inputs:") * 4 + ("",)) + f"chosen{depth}", kind))
         links[-2].connectionPathList.explicitItems = [links[-1].path]
     if chance.random() < 0.1:  # a circle
         links[-1].connectionPathList.explicitItems = [links[0].path]
@@ -158,15 +160,15 @@ def slender(layer, prims, chance) -> str:
     if chance.random() < 0.5:
         prim.typeName = chance.choice(("Cube", "Cylinder", "Capsule", "Cone", "Cylinder", "Sphere"))
         for name, size in (("size", 1.0), ("radius", first), ("height", second)):
-            _attribute(prim, name, "double").default = 0.01 * size
+            declare(prim, name, "double").default = 0.01 * size
     order = prim.attributes["xformOpOrder"].default if "xformOpOrder" in prim.attributes else None
     if isinstance(order, Vt.TokenArray) and "xformOp:scale:slender" in order:
         return f"{prim.path} of other sizes"
     given = order if isinstance(order, Vt.TokenArray) else ()
-    _attribute(prim, "xformOp:scale:slender", "double3").default = Gf.Vec3d(first, second, 1.0)
-    _attribute(prim, "xformOpOrder", "token[]").default = Vt.TokenArray([*given, "xformOp:scale:slender"])
+    declare(prim, "xformOp:scale:slender", "double3").default = Gf.Vec3d(first, second, 1.0)
+    declare(prim, "xformOpOrder", "token[]").default = Vt.TokenArray([*given, "xformOp:scale:slender"])
     if chance.random() < 0.4:
-        _attribute(prim, "warpmag:momentSpacing", "float").default = chance.choice((1e-9, 1e-5, 1e-3, 0.1, 1e9))
+        declare(prim, "warpmag:momentSpacing", "float").default = chance.choice((1e-9, 1e-5, 1e-3, 0.1, 1e9))
     return f"{prim.path} stretched by {first}, {second}"
 
 
@@ -177,7 +179,7 @@ def plates(layer, prims, chance) -> str:
     distance, thickness = chance.choice(DISTANCES), chance.choice(THICKNESSES)
     plate = _add_plate(layer, "/Plate", (0.06, 0.06, thickness), (0.0, 0.0, distance), (0.0, 0.0, 0.0))
     if chance.random() < 0.1:  # cells cannot conduct
-        _attribute(plate, "warpmag:conductivity", "float").default = 1e6
+        declare(plate, "warpmag:conductivity", "float").default = 1e6
     places = chance.choices(("inside", "same", "on", "across", "turned"), k=chance.choice((0, 0, 1, 1, 2, 3)))
     for number, place in enumerate(places):
         sheet, side = chance.choice(THICKNESSES), chance.choice((0.06, 0.06, 0.02))
@@ -191,13 +193,13 @@ def plates(layer, prims, chance) -> str:
         center = (offset[0], offset[1], distance + offset[2])
         prim = _add_plate(layer, f"/Sheet{number}", (side, side, sheet), center, turn)
         if number:  # a second sheet of automatic cells would have more than two thousand with the others
-            _attribute(prim, "warpmag:momentSpacing", "float").default = chance.choice((0.006, 0.02))
+            declare(prim, "warpmag:momentSpacing", "float").default = chance.choice((0.006, 0.02))
     return f"a plate at {distance}, sheets {places}"
 
 
 def _add_plate(layer, path, sides, center, turn) -> Sdf.PrimSpec:
     """Add a plate of iron of sides [m] at a center [m], turned by angles [deg]."""
-    prim = _define(layer, path, "Cube")
+    prim = define(layer, path, "Cube")
     apis = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "WarpmagMagnetAPI"]
     prim.SetInfo("apiSchemas", Sdf.TokenListOp.CreateExplicit(apis))
     values = {
@@ -209,14 +211,14 @@ def _add_plate(layer, path, sides, center, turn) -> Sdf.PrimSpec:
         "warpmag:material": ("token", "iron"),
     }
     for name, (kind, value) in values.items():
-        _attribute(prim, name, kind).default = value
+        declare(prim, name, kind).default = value
     return prim
 
 
 def circuit(layer, prims, chance) -> str:
     """Add a coil that answers to a voltage, one of whose numbers is odd."""
     prim = layer.GetPrimAtPath(chance.choice(prims)) if chance.random() < 0.5 else None
-    prim = prim or _define(layer, f"/Driven{chance.randrange(1000)}", "Xform")
+    prim = prim or define(layer, f"/Driven{chance.randrange(1000)}", "Xform")
     before = prim.GetInfo("apiSchemas").GetAppliedItems() if prim.HasInfo("apiSchemas") else []
     prim.SetInfo("apiSchemas", Sdf.TokenListOp.CreateExplicit([*dict.fromkeys((*before, "WarpmagCoilAPI"))]))
     numbers = {"radius": 0.02, "wireRadius": 1e-3, "resistance": 2.0, "turns": 100.0, "voltage": 12.0}
@@ -224,7 +226,7 @@ def circuit(layer, prims, chance) -> str:
     odd = chance.choice(sorted(numbers))
     numbers[odd] = chance.choice(SIZES)
     for name, value in numbers.items():
-        _attribute(prim, f"warpmag:coil:{name}", "float").default = value
+        declare(prim, f"warpmag:coil:{name}", "float").default = value
     if chance.random() < 0.3:
         for time in (0.0, 10.0):
             layer.SetTimeSample(prim.path.AppendProperty("warpmag:coil:voltage"), time, chance.choice(SIZES))
@@ -278,7 +280,7 @@ def long_transform(layer, prims, chance) -> str:
             if name not in prim.attributes:
                 Sdf.AttributeSpec(prim, name, Sdf.ValueTypeNames.Double3).default = Gf.Vec3d(0.0, 0.0, 1e-6)
     order = (names * (1 + count // len(names)))[:count] if chance.random() < 0.5 else names[:1] * count
-    _attribute(prim, "xformOpOrder", "token[]").default = Vt.TokenArray(order)
+    declare(prim, "xformOpOrder", "token[]").default = Vt.TokenArray(order)
     return f"{count} transform operations on {prim.path}"
 
 
@@ -286,17 +288,3 @@ HOSTILE: tuple[Callable, ...] = (
     *(texture, texture, texture, clips, clips, slender, slender, schemas, connections, connections, long_transform),
     *(plates, plates, circuit, circuit),
 )
-
-
-def _define(layer, path, kind) -> Sdf.PrimSpec:
-    prim = Sdf.CreatePrimInLayer(layer, path)
-    prim.specifier = Sdf.SpecifierDef
-    if kind:
-        prim.typeName = kind
-    return prim
-
-
-def _attribute(prim, name, kind) -> Sdf.AttributeSpec:
-    if name in prim.properties:
-        prim.RemoveProperty(prim.properties[name])
-    return Sdf.AttributeSpec(prim, name, Sdf.ValueTypeNames.Find(kind))

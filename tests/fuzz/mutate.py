@@ -10,6 +10,7 @@ from pxr import Gf, Sdf, Tf, Vt
 import warpmag.usd  # noqa: F401  (registers the schemas before a stage is opened)
 
 from .hostile import HOSTILE
+from .hurried import HURRIED
 from .strangers import STRANGERS
 
 _MANY = 500
@@ -140,7 +141,7 @@ def mutate(scene: Path, target: Path, seed: int, fewest: int = 1) -> tuple[str, 
     layer.TransferContent(Sdf.Layer.FindOrOpen(str(scene)))
     done = []
     for _ in range(chance.randint(fewest, 3)):
-        fault = chance.choice(chance.choice((FAULTS, STRANGERS, HOSTILE)))
+        fault = chance.choice(chance.choice((FAULTS, STRANGERS, HOSTILE, HURRIED)))
         try:
             done.append(fault(layer, _prims(layer), chance))
         except Tf.ErrorException:  # USD does not let a layer hold it

@@ -4,6 +4,7 @@ Nothing of warpmag's own reader is used: bodies, poses, sizes, masses, frictions
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -106,9 +107,11 @@ class Reading:
             local = self.mesh_volume(prim)
         return None if local is None else abs(local * np.linalg.det(matrix))
 
-    def mesh_volume(self, prim) -> float:
+    def mesh_volume(self, prim) -> float | None:
         points = np.array(self.get(prim, "points"), dtype=float)
         if self.get(prim, "physics:approximation", "none") == "convexHull":
+            if not self.is_closed(prim):  # ``check`` warns
+                return None
             from scipy.spatial import ConvexHull  # noqa: PLC0415
 
             return ConvexHull(points).volume
@@ -120,6 +123,17 @@ class Reading:
             for k in range(1, count - 1):
                 total += face[0] @ np.cross(face[k], face[k + 1]) / 6.0
         return total
+
+    def is_closed(self, prim) -> bool:
+        """Return True if each edge of a mesh has its counterpart."""
+        indices, place, edges = self.get(prim, "faceVertexIndices"), 0, Counter()
+        for count in self.get(prim, "faceVertexCounts"):
+            face = indices[place : place + count]
+            place += count
+            for first, second in zip(face, [*face[1:], *face[:1]], strict=True):
+                edges[first, second] += 1
+                edges[second, first] -= 1
+        return not any(edges.values())
 
     def material(self, prim):
         """The material that is bound to a collider where the schema of bindings is applied, too."""

@@ -11,6 +11,7 @@ import csv
 import math
 import os
 import re
+import stat
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -251,6 +252,8 @@ def _checked_saturation(name: str, h, m, slope: float, given) -> float:
 def _read_csv(path, name: str):
     """Return (quantity, factor to SI) of each of the two columns of a file, and the rows."""
     try:
+        if not stat.S_ISREG(os.stat(path).st_mode):  # a pipe would wait for ever
+            raise OSError("not a regular file")
         with open(path, newline="", encoding="utf-8-sig") as file:
             lines = [row for row in csv.reader(line for line in file if line.strip() and line.lstrip()[0] != "#")]
     except (OSError, ValueError, csv.Error) as error:  # text in another encoding, or a name with a null character

@@ -38,7 +38,8 @@ def magnet_findings(prim: Usd.Prim) -> Iterator[Finding]:
         if approximation in _AS_DRAWN:
             yield Finding(str(prim.GetPath()), str(error))
         else:
-            message = f"{error}: its approximation for collisions, {approximation}, is magnetized in its place"
+            place = f"its approximation for collisions, {approximation}, is magnetized in its place"
+            message = f"{error}: {place}, and a density gives it the mass of the open mesh"
             yield Finding(str(prim.GetPath()), message, "warning")
 
 

@@ -22,6 +22,7 @@ from pxr import Sdf, Tf
 
 from warpmag.errors import InputError
 from warpmag.usd.paths import usable_path
+from warpmag.usd.read.trial_read import irregular_file
 from warpmag.usd.values import quiet
 
 _SUFFIXES = (".usd", ".usda", ".usdc")
@@ -154,6 +155,8 @@ class Output:
 
     def load_checkpoint(self) -> tuple[dict[str, str], dict[str, np.ndarray]] | None:
         """Return the identity of the run and the arrays of its checkpoint, None where there is none."""
+        if reason := irregular_file(self.checkpoint):  # a pipe would wait for ever
+            raise InputError(reason)
         try:
             with open(self.checkpoint, "rb") as file, np.load(file, allow_pickle=False) as saved:
                 arrays = dict(saved)
