@@ -243,7 +243,6 @@ def in_process(*arguments: str) -> tuple[int, list[str], list[str]]:
         except BaseException:
             traceback.print_exc()
             code = -1
-        sys.stdout.flush(), sys.stderr.flush()
     return code, out[0].splitlines(), err[0].splitlines()
 
 
@@ -258,15 +257,20 @@ def in_fresh_process(*arguments: str) -> tuple[int, list[str], list[str]]:
 
 @contextlib.contextmanager
 def _caught(descriptor: int) -> Iterator[list[str]]:
-    """Catch what is written to a file descriptor, by native code as well."""
-    sys.stdout.flush(), sys.stderr.flush()
-    before, text = os.dup(descriptor), []
+    """Catch what is written to a file descriptor, by native code as well, and to Python's stream of it."""
+    name = {1: "stdout", 2: "stderr"}[descriptor]
+    stream, text = getattr(sys, name), []
+    stream.flush()
+    before = os.dup(descriptor)
     with tempfile.TemporaryFile() as file:
         os.dup2(file.fileno(), descriptor)
+        # pytest's stream writes to a file of its own
+        setattr(sys, name, os.fdopen(os.dup(descriptor), "w", encoding="utf-8", errors="replace"))
         try:
             yield text
         finally:
-            sys.stdout.flush(), sys.stderr.flush()
+            getattr(sys, name).close()
+            setattr(sys, name, stream)
             os.dup2(before, descriptor)
             os.close(before)
             file.seek(0)

@@ -120,7 +120,7 @@ SOLIDS: dict[str, Callable] = {
     "two that intersect": lambda chance: _two_boxes((0.5, chance.choice((0.0, 0.5)), chance.choice((0.0, 1e-7, 0.5)))),
     "two at an edge": lambda _: _two_boxes((1.0, 1.0, 0.0)),
     "two far apart": lambda chance: _two_boxes((chance.choice((20.0, 1e4)), 0.0, 0.0)),
-    "far from its origin": lambda chance: (_box((chance.choice((1e3, 1e6, 1e9)), 0.0, 0.0)), BOX),
+    "far from its origin": lambda chance: (_box((chance.choice((10.0, 1e3, 1e9)), 0.0, 0.0)), BOX),
     "a star": _star,
     "a soup": _soup,
     "a strip": _strip,

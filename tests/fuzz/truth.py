@@ -108,13 +108,10 @@ class Reading:
         return None if local is None else abs(local * np.linalg.det(matrix))
 
     def mesh_volume(self, prim) -> float | None:
+        """Volume of a mesh, also of one whose hull collides; None for the hull of an open mesh (a warning)."""
+        if self.get(prim, "physics:approximation", "none") == "convexHull" and not self.is_closed(prim):
+            return None
         points = np.array(self.get(prim, "points"), dtype=float)
-        if self.get(prim, "physics:approximation", "none") == "convexHull":
-            if not self.is_closed(prim):  # ``check`` warns
-                return None
-            from scipy.spatial import ConvexHull  # noqa: PLC0415
-
-            return ConvexHull(points).volume
         total, place = 0.0, 0
         indices = np.array(self.get(prim, "faceVertexIndices"))
         for count in self.get(prim, "faceVertexCounts"):
