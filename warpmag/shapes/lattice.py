@@ -258,10 +258,10 @@ def fill(
     if spacing > 0.0 and not fits([p.upper - p.lower for p in parts], spacing, largest):
         raise too_many
     most = max(AUTOMATIC_COUNT, across**3 * len(parts))
-    automatic, across = _automatic_cells(parts, across, most, together)
+    automatic, across, grids = _automatic_cells(parts, across, most, together)
     if spacing > 0.0:
         # shapes with much common volume have an automatic spacing above the sides of their cells
-        longest = max(cells.sides.max() for cells in _grids(parts, automatic, across, together))
+        longest = max(cells.sides.max() for cells in grids)
         lattice = _fill(parts, spacing, across if spacing < min(automatic, longest) else 1, together)
         if len(lattice.volumes) > largest:
             raise too_many
@@ -284,20 +284,21 @@ def _steps(lattice: Lattice, most: int) -> int:
     return max(1, int(np.log(len(lattice.volumes) / most) / np.log(_STEP)) - 1)
 
 
-def _automatic_cells(parts: Sequence[Solid], across: int, most: int, together: bool) -> tuple[float, int]:
-    """Return the spacing [m] at which the shapes have the volume of at most ``most`` cells, and the cells across."""
+def _automatic_cells(
+    parts: Sequence[Solid], across: int, most: int, together: bool
+) -> tuple[float, int, list[CellGrid]]:
+    """Return the spacing [m] at which the shapes have the volume of at most ``most`` cells, cells across, and grids."""
     first = (sum(p.volume for p in parts) / AUTOMATIC_COUNT) ** (1.0 / 3.0)
     widest = max((p.upper - p.lower).max() for p in parts)
-    spacing = first
     for fewer in range(across, 0, -1):
         spacing = first
         grids = _grids(parts, spacing, fewer, together)
         while _cell_volumes(grids) > most * (1.0 + 1e-9) and spacing < widest:
             spacing *= _STEP
             grids = _grids(parts, spacing, fewer, together)
-        if all(_is_nearly_cubic(cells.sides) for cells in grids):
-            return spacing, fewer
-    return spacing, 1
+        if fewer == 1 or all(_is_nearly_cubic(cells.sides) for cells in grids):
+            break
+    return spacing, fewer, grids
 
 
 def _grids(parts: Sequence[Solid], spacing: float, across: int, together: bool) -> list[CellGrid]:
