@@ -19,6 +19,7 @@ namespace warpmag {
 constexpr int MATRIX_ROWS = 9, DETAIL_ROWS = 27; // of means; of, at and between differences; as in cell_pairs.py
 constexpr int POSE_ROWS = 7;                     // position and quaternion of box j
 constexpr Real BALL = Real(4.1887902047863905);  // volume of a ball over r³
+constexpr Real FAR = Real(8);                    // component of the quaternion of pairs that are not near
 constexpr Real POSE_TOLERANCE = Real(3e-5);      // largest change of a pose, in sizes, that counts as rest
 
 constexpr int CLASSES = 16, BINS = CLASSES * CLASSES; // of rows by their numbers of close and of all candidates
@@ -181,6 +182,13 @@ template <class Pairs> struct Rows {
     }
     // Where a candidate is another cell.
     CUDA_CALLABLE Mask listed(const Cells& other) const { return mask_of(indices(own.at) != indices(other.at)); }
+    // Where a candidate is in the window.
+    CUDA_CALLABLE Mask near(const Boxes& box, const Cells& other) const {
+        const Four place = four_at(a.box.data, 0, other.at), sides = four_at(a.box.data, 1, other.at);
+        const Vector apart = Vector{place.x, place.y, place.z} - box.center;
+        const Number reach = WINDOW_END / 2 * (box.size + sides.w);
+        return listed(other) & (dot(apart, apart) < reach * reach);
+    }
     CUDA_CALLABLE BoxPair pair(const Boxes& box, const Cells& other, const Boxes& other_box,
                                const RelativePose& pose) const {
         return box_pair(box, other_box, pose, listed(other), precedes(own, other));
@@ -235,21 +243,25 @@ CUDA_CALLABLE inline Vector vectors_of(const Real* array, const Cells& cells) {
 #endif
 }
 
-// Relative pose of a pair in numbers, and where it differs from the stored one.
+// Relative pose of a pair in numbers, and where it differs from the stored one. Pairs that are not near have one pose.
 struct PoseRows {
     Number now[POSE_ROWS];
     Mask moved;
 
-    CUDA_CALLABLE PoseRows(const Real* rows, const RelativePose& pose, Number size)
+    CUDA_CALLABLE PoseRows(const Real* rows, const RelativePose& pose, Number size, Mask near)
         : now{pose.r.x, pose.r.y, pose.r.z, pose.q[0], pose.q[1], pose.q[2], pose.q[3]} {
-        Number change = size * Real(0);
+        const Number zero = size * Real(0);
+        Number change = zero;
         for (int k = 0; k < POSE_ROWS; ++k) {
+            now[k] = near ? now[k] : zero + (k == 3 ? FAR : Real(0));
             const Number difference = now[k] - numbers(rows + k * CHUNK),
                          scaled = k < 3 ? difference / size : difference;
             change = larger(change, larger(scaled, -scaled));
         }
         moved = change > POSE_TOLERANCE;
     }
+    // True if none of the stored pairs was near: their matrices are 0.
+    static CUDA_CALLABLE bool all_far(const Real* rows) { return !any(numbers(rows + 3 * CHUNK) != FAR); }
     CUDA_CALLABLE void store(Real* rows) const {
         for (int k = 0; k < POSE_ROWS; ++k) put(rows + k * CHUNK, moved ? now[k] : numbers(rows + k * CHUNK));
     }
@@ -262,17 +274,20 @@ template <class Pairs> CUDA_CALLABLE inline void tabulate(const Pairs& a, int ro
     const Boxes box = rows.boxes(rows.own);
     const Number zero = box.size * Real(0);
     Number overlap = zero;
+    int end = 0;
     for_candidates(rows.slots, rows.close_slots(), [&](int slot, Points points) {
         const Cells other = rows.candidates(slot);
+        const Mask near = rows.near(box, other);
+        Real* const stored = slot_at(a.pose.data, rows.capacity, POSE_ROWS, slot, row);
+        if (!any(near) && PoseRows::all_far(stored)) return;
+        if (any(near)) end = slot + 1;
         const Boxes other_box = rows.boxes(other);
         const RelativePose pose = relative_pose(box, other_box);
-        const Mask induced = rows.listed(other) && other_box.inducible;
+        const Mask induced = near & other_box.inducible;
         if (points.first == 0) overlap += induced ? overlap_share(box, other_box, pose) : zero;
-        Real* const stored = slot_at(a.pose.data, rows.capacity, POSE_ROWS, slot, row);
-        const PoseRows change(stored, pose, box.size);
+        const PoseRows change(stored, pose, box.size, near);
         if (!any(change.moved)) return;
         const BoxPair pair = rows.pair(box, other, other_box, pose);
-        const Mask near = pair.window.value > Real(0);
         const Number factor = pair.window.value * pair.unit * pair.unit * pair.unit;
         PairMatrices matrices;
         if (any(near)) matrices = pair_matrices(pair, points);
@@ -290,6 +305,8 @@ template <class Pairs> CUDA_CALLABLE inline void tabulate(const Pairs& a, int ro
     });
     const Number within = (group_sum(overlap) - OVERLAP_BEGIN) / (OVERLAP_END - OVERLAP_BEGIN);
     overlap = smaller(larger(within, zero), zero + 1);
+    end = group_most(end);
+    if (share() == 0) a.near_end.data[row] = end;
     if (share() == 0) put(a.overlap_factor.data + row, OVERLAP_DEMAGNETIZATION * overlap / box.volume);
 }
 
@@ -314,7 +331,7 @@ template <class Pairs> CUDA_CALLABLE inline void add_field(const Pairs& a, int r
     const int may_be_close = a.close_capacity > 0 ? rows.close_slots() : 0;
     const int close = may_be_close < a.close_capacity ? may_be_close : a.close_capacity;
     Vector h = {zero, zero, zero}, g = h;
-    for (int slot = share(); slot < rows.slots; slot += SHARES) {
+    for (int slot = share(); slot < a.near_end.data[row]; slot += SHARES) {
         const Cells other = rows.candidates(slot);
         const Vector m = vectors_of(means, other);
         h += matrix_times(slot_at(a.matrix.data, rows.capacity, MATRIX_ROWS, slot, row), m);
@@ -342,12 +359,13 @@ template <class Pairs> CUDA_CALLABLE inline void add_force(const Pairs& a, int r
     const Vector m = vectors_of(means, rows.own), difference = vectors_of(differences, rows.own);
     const Number zero = box.size * Real(0);
     Vector force = {zero, zero, zero}, torque = force;
-    for_candidates(rows.slots, rows.close_slots(), [&](int slot, Points points) {
+    const int end = a.near_end.data[row], close = rows.close_slots();
+    for_candidates(end, close < end ? close : end, [&](int slot, Points points) {
         const Cells other = rows.candidates(slot);
+        const Mask near = rows.near(box, other);
+        if (!any(near)) return;
         const Boxes other_box = rows.boxes(other);
         const BoxPair pair = rows.pair(box, other, other_box, relative_pose(box, other_box));
-        const Mask near = pair.window.value > Real(0);
-        if (!any(near)) return;
         const Number cube = pair.unit * pair.unit * pair.unit;
         const PairMoments moments = {m, cube * to_world(pair.rotation, vectors_of(means, other)), difference,
                                      cube * vectors_of(differences, other)};

@@ -105,6 +105,7 @@ def cell_pairs_type(dtype):
         kinds: wp.array[int]  # numbers of each kind of candidates, shape [n, KINDS], flat
         cell: wp.array[int]  # cell of each row, shape [c padded]
         column: wp.array[int]  # candidates of each row, shape [c padded / CHUNK, capacity, CHUNK], flat
+        near_end: wp.array[int]  # end of the slots in the window, of vectors of rows, shape [c padded]
         pose: wp.array[dtype]  # relative pose of each tensor, shape [c padded / CHUNK, capacity, 7, CHUNK], flat
         overlap_factor: wp.array[dtype]  # demagnetizing factor of overlaps over the volume [1/m³], shape [c padded]
         matrix: wp.array[dtype]  # T_ij of means [1/m³], shape [c padded / CHUNK, capacity, 9, CHUNK], flat
@@ -251,7 +252,7 @@ class CellPairs:
         self.crowded, a.kinds = zeros(1), zeros(_KINDS * n)
         a.crowded = self.crowded
         a.rows, a.bin, a.bin_end = zeros(1), zeros(n), zeros(_BINS)
-        a.cell, a.overlap_factor = zeros(padded), zeros(padded, kind=dtype)
+        a.cell, a.near_end, a.overlap_factor = zeros(padded), zeros(padded), zeros(padded, kind=dtype)
         a.pose = _large_zeros(padded * capacity * _POSE_ROWS, dtype, device)
         a.column = _large_zeros(padded * capacity, wp.int32, device)
         a.close_capacity = min(capacity, _LONGEST_CLOSE) if a.linear.numpy().any() else 0

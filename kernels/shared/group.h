@@ -35,6 +35,14 @@ CUDA_CALLABLE inline int group_count(int part) {
     for (int step = 1; step < GROUP; step *= 2) part += __shfl_xor_sync(group_mask(), part, step);
     return part;
 }
+// Largest integer of the threads of a group.
+CUDA_CALLABLE inline int group_most(int part) {
+    for (int step = 1; step < GROUP; step *= 2) {
+        const int other = __shfl_xor_sync(group_mask(), part, step);
+        part = other > part ? other : part;
+    }
+    return part;
+}
 // Value of the first thread of a group.
 CUDA_CALLABLE inline int of_first_share(int value) { return __shfl_sync(group_mask(), value, 0, GROUP); }
 // Place of this thread among those of its group that ask for one, from ``next`` on, which moves by their number.
@@ -50,6 +58,7 @@ inline constexpr int share() { return 0; }
 inline Number group_total(Number part) { return part; }
 inline Number group_sum(Number part) { return part; }
 inline int group_count(int part) { return part; }
+inline int group_most(int part) { return part; }
 inline int of_first_share(int value) { return value; }
 inline int next_place(bool asks, int& next) { return asks ? next++ : next; }
 // Largest count among a vector's balls.
