@@ -18,49 +18,66 @@ import warp as wp
 
 from warpmag.kernels.induction.solve_state import state_type
 from warpmag.kernels.induction.theta_flow import FLOW_STEP
-from warpmag.kernels.shared.axpy import launch_add_scaled
 
 _CONTACT = 0.2
 """Twice the volume over its own that a cell's ball shares with balls of bodies in contact, up to which e is 0."""
 
 
 @cache
-def _kernel(dtype):
+def _kernels(dtype):
+    """Kernels that write the residuals of cells, and that add the change of the field by the residuals of a body."""
     vec3, mat33, quaternion = wp.types.vector(3, dtype), wp.types.matrix((3, 3), dtype), wp.types.quaternion(dtype)
-    state_struct, ball = state_type(dtype), 4.0 / 3.0 * np.pi
+    vec2, state_struct, ball = wp.types.vector(2, dtype), state_type(dtype), 4.0 / 3.0 * np.pi
+
+    @wp.func
+    def rests(state: state_struct, world: int) -> bool:
+        return state.worlds[world].active == 0 or state.worlds[world].apart > 0
 
     @wp.kernel(module="unique", enable_backward=False)
-    def change_field(
+    def write_residuals(
+        cell: wp.array[wp.vec4i],
+        rotation: wp.array[quaternion],
+        state: state_struct,
+        residuals: wp.array[vec3],
+        ratios: wp.array[vec2],
+    ):
+        row = cell[wp.tid()]
+        j = row[0]
+        if rests(state, row[3]):
+            return
+        s, radius, slope, full = state.s[j], state.packed[3, j], state.slope[j], dtype(1.0)
+        residual = slope / state.saturation[j] * state.h[j] - s
+        residuals[j] = wp.quat_rotate_inv(rotation[row[1]], residual)
+        most = dtype(wp.static(ball)) * radius * radius * radius * state.saturation[j] * wp.length(s)
+        share = wp.where(most > dtype(0.0), wp.min(wp.length(state.moments[j]) / most, full), full)
+        stiffness = dtype(wp.static(2.0 * FLOW_STEP)) / state.step[j] - full
+        excess = wp.max(stiffness - slope * dtype(wp.static(2.0 / 3.0 + _CONTACT)), dtype(0.0))
+        ratios[j] = vec2(share * slope / dtype(3.0), excess)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_changes(
         cell: wp.array[wp.vec4i],
         body: wp.array[wp.vec2i],
         gain: wp.array[dtype],
         table: wp.array[mat33],
         rotation: wp.array[quaternion],
         state: state_struct,
-        change: wp.array[vec3],
+        residuals: wp.array[vec3],
+        ratios: wp.array[vec2],
     ):
         row = cell[wp.tid()]
-        i, turn, cells = row[0], rotation[row[1]], body[row[1]]
-        response, ratio, excess, full = vec3(), dtype(0.0), dtype(0.0), dtype(1.0)
-        if state.worlds[row[3]].active == 0 or state.worlds[row[3]].apart > 0:
-            change[i] = response
+        if rests(state, row[3]):
             return
+        i, cells, response, ratio, full = row[0], body[row[1]], vec3(), vec2(), dtype(1.0)
         for k in range(cells[1]):
-            j = cells[0] + k
-            s, radius, slope = state.s[j], state.packed[3, j], state.slope[j]
-            residual = slope / state.saturation[j] * state.h[j] - s
-            response += table[row[2] + k] * wp.quat_rotate_inv(turn, residual)
-            most = dtype(wp.static(ball)) * radius * radius * radius * state.saturation[j] * wp.length(s)
-            share = wp.where(most > dtype(0.0), wp.min(wp.length(state.moments[j]) / most, full), full)
-            ratio += share * slope / dtype(3.0)
-            stiffness = dtype(wp.static(2.0 * FLOW_STEP)) / state.step[j] - full
-            excess += wp.max(stiffness - slope * dtype(wp.static(2.0 / 3.0 + _CONTACT)), dtype(0.0))
+            response += table[row[2] + k] * residuals[cells[0] + k]
+            ratio += ratios[cells[0] + k]
         largest, count = gain[row[1]], dtype(cells[1])
-        least = full + excess / count - ratio / count * largest / (full + largest)
+        least = full + ratio[1] / count - ratio[0] / count * largest / (full + largest)
         weight = wp.max(full / least - full, dtype(0.0)) / largest
-        change[i] = weight * state.saturation[i] / state.slope[i] * wp.quat_rotate(turn, response)
+        state.h[i] += weight * state.saturation[i] / state.slope[i] * wp.quat_rotate(rotation[row[1]], response)
 
-    return change_field
+    return write_residuals, add_changes
 
 
 class BodySteps:
@@ -93,14 +110,16 @@ class BodySteps:
             return wp.array(values, dtype=kind, device=device)
 
         cell = put(np.concatenate(cells).astype(np.int32), wp.vec4i)
-        table = put(np.concatenate(tables), wp.types.matrix((3, 3), dtype))
-        self._state, self._change = state, wp.zeros_like(state.h)
-        inputs = [cell, put(ranges, wp.vec2i), put(gains, dtype), table, rotations, state]
-        self._launch = wp.launch(
-            _kernel(dtype), dim=len(cell), inputs=inputs, outputs=[self._change], device=device, record_cmd=True
-        )
+        mat33 = wp.types.matrix((3, 3), dtype)
+        tables = cell, put(ranges, wp.vec2i), put(gains, dtype), put(np.concatenate(tables), mat33), rotations, state
+        buffers = wp.zeros_like(state.h), wp.zeros(len(state.h), dtype=wp.types.vector(2, dtype), device=device)
+        arguments = (cell, rotations, state, *buffers), (*tables, *buffers)
+        self._launches = [
+            wp.launch(kernel, dim=len(cell), inputs=inputs, device=device, record_cmd=True)
+            for kernel, inputs in zip(_kernels(dtype), arguments, strict=True)
+        ]
 
     def launch(self):
         """Launch the change of the field at the moments of the bodies."""
-        self._launch.launch()
-        launch_add_scaled(self._change, self._state.h)
+        for launch in self._launches:
+            launch.launch()
