@@ -25,8 +25,8 @@ from warpmag.kernels.shared.pieces import cut
 from warpmag.kernels.shared.reductions import group_threads, most_blocks
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
-AT_TARGETS, AT_POINTS, AT_CELLS, AT_NEIGHBORS, AT_BALLS, ON_CELLS, REACT, ADD_UP = range(
-    8
+AT_TARGETS, AT_POINTS, FIND_CELLS, AT_CELLS, AT_NEIGHBORS, AT_BALLS, ON_CELLS, REACT, ADD_UP = range(
+    9
 )  # passes; as in ``passes.h``
 OF_TARGETS, OF_BALLS, OF_CELLS = range(3)  # kinds of rows; as in ``passes.h``
 _TARGETS_PER_THREAD, _BALLS_PER_THREAD, _CELLS_PER_THREAD = 500, 50, 50
@@ -122,7 +122,7 @@ class AppliedField:
             switches = bool(sources.applied), bool(sources.solids), self.cell_count > 0, bool(self.rates)
             kernel = _kernel(sources.dtype, *pass_and_group, *switches, self.balls)
             sizes = dict(threads=threads_for(items, share), gpu_threads=group * items)
-            of_cells = dict.fromkeys((AT_CELLS, AT_NEIGHBORS, ON_CELLS), self.arrays.cells.active)
+            of_cells = dict.fromkeys((FIND_CELLS, AT_CELLS, AT_NEIGHBORS, ON_CELLS), self.arrays.cells.active)
             active = {AT_TARGETS: self.arrays.targets.active, **of_cells}.get(first)
             sizes["max_blocks"] = most_blocks(self.device) if active else 0
             self._commands[key] = launch_passes(
@@ -134,11 +134,11 @@ class AppliedField:
     def launch(self):
         """Launch the evaluation of the field at the targets, from the present positions of sources and targets."""
         self._launch_at_targets()
-        ranges = (
-            [(AT_CELLS, AT_CELLS), (AT_NEIGHBORS, AT_NEIGHBORS)] if self.device.is_cuda else [(AT_CELLS, AT_NEIGHBORS)]
-        )
-        for first, last in ranges:
-            self.run_passes(first, last, self.cell_count, _GROUP, _CELLS_PER_THREAD)
+        if self.device.is_cpu:
+            self.run_passes(FIND_CELLS, AT_NEIGHBORS, self.cell_count, 1, _CELLS_PER_THREAD)
+            return
+        for number, group in ((FIND_CELLS, 1), (AT_CELLS, _GROUP), (AT_NEIGHBORS, 1)):
+            self.run_passes(number, number, self.cell_count, group, 1)
 
     def launch_left_out(self):
         """Launch the evaluation at the targets that :meth:`launch` leaves out; not to be captured in a graph."""

@@ -168,10 +168,24 @@ CUDA_CALLABLE inline Real3 coarse_differences(const Cell& cell, const Real* unit
         cell.add_mean_field(units, 6, k, range.weight, outer_field(body, cylinder, cell.points(units, k)).phi, sums);
     return total_of(sums);
 }
+// Marks cell c as a far one unless a body is near it. A thread does this for one cell: most cells are far.
+template <class Arrays> CUDA_CALLABLE inline void find_near_bodies(const Arrays& arrays, int c) {
+    const Cell cell = cell_at(arrays, c);
+    int nearness = FAR_CELL;
+    for (int b = cell.first; b < cell.last; ++b) {
+        const CellFades fade = cell_fades(cell, body_at(arrays, b));
+        if (fade.fine.weight + fade.coarse.weight > 0) nearness = STEEP_CELL;
+    }
+    arrays.cells.near.data[c] = nearness;
+    if (nearness != FAR_CELL) return;
+    put_real3(arrays.cells.change, c, {0, 0, 0});
+    put_real3(arrays.cells.steepness, c, {0, 0, 0});
+}
 // Replaces the fields of near bodies at the center of cell c by their averages, and writes the differences of the field
 // between its halves, and the potentials at the points of its faces, without those of the average field: the
 // magnetization responds to it.
 template <class Arrays> CUDA_CALLABLE inline void average_over_cell(const Arrays& arrays, int c) {
+    if (!arrays.cells.near.data[c]) return;
     const Cell cell = cell_at(arrays, c);
     const Real* const units = arrays.cells.point.data;
     Real* const potential = arrays.cells.potential.data + OUTER_POINTS * (size_t)c;
@@ -330,10 +344,11 @@ CUDA_CALLABLE inline void add_cell_wrench(const Arrays& arrays, const Cell& cell
 // Adds force and torque of near bodies on cell c. The torque m × H of its moment contains the averages already.
 // Writes those of a body that is the only source, for its reaction.
 template <class Arrays> CUDA_CALLABLE inline void act_on_cell(const Arrays& arrays, int c) {
+    if (!arrays.cells.near.data[c]) return;
     const Cell cell = cell_at(arrays, c);
     const bool movable = arrays.cells.movable.data[cell.moment];
     const bool only = arrays.only.data[arrays.coils.kind.shape[0] + cell.first];
-    if (!arrays.cells.near.data[c] || !(movable || only)) return;
+    if (!(movable || only)) return;
     const size_t pitch = arrays.effective.strides[0] / sizeof(Real);
     const Real3 m = effective_at(arrays.effective.data, pitch, cell.moment);
     const Real3 change = real3((const Real*)arrays.cells.change.data + 3 * (size_t)c);

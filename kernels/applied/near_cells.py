@@ -182,6 +182,8 @@ def _image_factor_kernel(dtype):
             if c >= cells.active[0]:
                 return
             c = cells.active[c + 1]
+        if cells.near[c] != wp.static(NEAR):
+            return
         i = cells.cell[c][0]
         k, volume = slope[i], dtype(4.18879020478639) * radii[i] * radii[i] * radii[i]
         reduced = wp.length(moments[i]) / (volume * saturation[i])
@@ -193,7 +195,7 @@ def _image_factor_kernel(dtype):
 
 
 def launch_image_factors(arrays, moments, radii, material):
-    """Write the factor (μ − 1)/(μ + 1) of the charges on the faces of cells, for their differential permeability μ.
+    """Write the factor (μ − 1)/(μ + 1) of the charges on faces of near cells, for their differential permeability μ.
 
     Args:
         arrays: The struct of :func:`cell_arrays_type`.

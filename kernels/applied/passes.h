@@ -16,9 +16,9 @@
 
 namespace warpmag {
 
-enum SourcePass { AT_TARGETS, AT_POINTS, AT_CELLS, AT_NEIGHBORS, AT_BALLS, ON_CELLS, REACT, ADD_UP }; // as in fields.py
-enum RowKind { OF_TARGETS, OF_BALLS, OF_CELLS };                                                      // as in fields.py
-constexpr int WRENCH_ROW = 7; // force, torque, energy
+enum SourcePass { AT_TARGETS, AT_POINTS, FIND_CELLS, AT_CELLS, AT_NEIGHBORS, AT_BALLS, ON_CELLS, REACT, ADD_UP };
+enum RowKind { OF_TARGETS, OF_BALLS, OF_CELLS }; // both enumerations as in fields.py
+constexpr int WRENCH_ROW = 7;                    // force, torque, energy
 
 // Targets from column i on: positions, radii, labels, and bits of their kind.
 constexpr int CORRECTED = 1, MAGNETIZED = 2; // bits of a target, as in sources.py
@@ -235,7 +235,9 @@ template <class Arrays> CUDA_CALLABLE inline int listed_item(const Arrays& array
         const int chunk = active_item(arrays.targets.active, n / CHUNK);
         return chunk < 0 ? chunk : CHUNK * chunk + n % CHUNK;
     }
-    return PASS == AT_CELLS || PASS == AT_NEIGHBORS || PASS == ON_CELLS ? active_item(arrays.cells.active, n) : n;
+    return PASS == FIND_CELLS || PASS == AT_CELLS || PASS == AT_NEIGHBORS || PASS == ON_CELLS
+               ? active_item(arrays.cells.active, n)
+               : n;
 }
 #endif
 
@@ -247,6 +249,8 @@ CUDA_CALLABLE inline void apply_sources(int thread, int first, int last, int thr
             if (pass == AT_TARGETS) field_at_targets<false>(arrays, i);
         if constexpr (PASS < 0 || PASS == AT_POINTS)
             if (pass == AT_POINTS) field_at_targets<true>(arrays, i);
+        if constexpr (CELLS && (PASS < 0 || PASS == FIND_CELLS))
+            if (pass == FIND_CELLS && has_bodies(arrays, i)) find_near_bodies(arrays, i);
         if constexpr (CELLS && (PASS < 0 || PASS == AT_CELLS))
             if (pass == AT_CELLS && has_bodies(arrays, i)) average_over_cell(arrays, i);
         if constexpr (CELLS && (PASS < 0 || PASS == AT_NEIGHBORS))
@@ -267,6 +271,7 @@ CUDA_CALLABLE inline void apply_sources(int thread, int first, int last, int thr
     auto item_count = [&](int pass) {
         switch (pass) {
         case AT_BALLS: return arrays.balls.ball.shape[0];
+        case FIND_CELLS:
         case AT_CELLS:
         case AT_NEIGHBORS:
         case ON_CELLS: return arrays.cells.cell.shape[0];
