@@ -75,7 +75,7 @@ def test_field_of_a_near_magnet_is_its_average_over_a_cell(device):
         polarization=(0.0, 0.0, REMANENCE), dimension=(0.02, 0.005), position=(0.0013, 0.0007, 0.0035)
     )  # fmt: skip
     cells = system.source_interaction.arrays.cells
-    rows, boxes = cells.cell.numpy()[:, 0], cells.box.numpy()[:, :3].astype(float)
+    rows, boxes = cells.cell.numpy()[:, 0], cells.half.numpy()[cells.row.numpy()].astype(float)
     positions, field = system.positions.numpy().astype(float)[rows], system._induction.h0.numpy()[rows]
     nodes, weights = np.polynomial.legendre.leggauss(8)
     nodes, weights = np.append(nodes - 1.0, nodes + 1.0) / 2.0, np.append(weights, weights) / 2.0  # of the halves

@@ -66,20 +66,21 @@ struct Cell {
     CUDA_CALLABLE bool is_outer(int face) const { return outer >> face & 1; }
 };
 template <class Arrays> CUDA_CALLABLE inline Cell cell_at(const Arrays& arrays, int c) {
-    const auto& row = arrays.cells.cell.data[c];  // moment, body of its rotation, range of permanent bodies
-    const auto& form = arrays.cells.form.data[c]; // bits of outer faces, index of its matrices
-    const Real* const box = arrays.cells.box.data + 4 * (size_t)c; // half sides, (μ − 1)/(μ + 1)
+    const auto& row = arrays.cells.cell.data[c]; // moment, body of its rotation, range of permanent bodies
+    const int own = arrays.cells.row.data[c];
+    const auto& form = arrays.cells.form.data[own]; // bits of outer faces, index of its matrices
+    const Real* const half = arrays.cells.half.data + 3 * (size_t)own;
     const Real* const q = (const Real*)arrays.cells.rotation.data + 4 * (size_t)row[1];
     const Real* const grid = arrays.cells.grid.data + 9 * (size_t)row[1]; // axes of the grid in the body's frame
     const Real pose[7] = {0, 0, 0, q[0], q[1], q[2], q[3]};
     const Frame body = frame_of(pose);
     Cell cell = {packed_real3(arrays, 0, row[0]),
                  {},
-                 {box[0], box[1], box[2]},
+                 {half[0], half[1], half[2]},
                  0,
                  packed_at(arrays, 3, row[0]),
                  packed_at(arrays, 7, row[0]),
-                 box[3],
+                 arrays.cells.factor.data[c],
                  row[0],
                  row[2],
                  row[3],
@@ -236,8 +237,9 @@ struct CellNeighbor {
     Real own, other;
 };
 template <class Arrays> CUDA_CALLABLE inline CellNeighbor cell_neighbor(const Arrays& arrays, int c, int side) {
-    const Real* const weights = arrays.cells.weight.data + 12 * (size_t)c;
-    return {arrays.cells.neighbor.data[6 * (size_t)c + side], weights[side], weights[6 + side]};
+    const size_t row = arrays.cells.row.data[c];
+    const Real* const weights = arrays.cells.weight.data + 12 * row;
+    return {arrays.cells.neighbor.data[6 * row + side], weights[side], weights[6 + side]};
 }
 // Adds the field by which differences between halves magnetize cell c: the derivative of their energy.
 template <class Arrays> CUDA_CALLABLE inline void add_differences(const Arrays& arrays, int c) {

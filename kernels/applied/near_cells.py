@@ -42,12 +42,15 @@ def cell_arrays_type(dtype):
 
     @wp.struct
     class CellArrays:
-        # Cells, shape [cells]:
-        cell: wp.array[wp.vec4i]  # moment, index of its body in ``rotation``, range of permanent bodies
+        # Cells of a shape, of all shapes one after the other, shape [rows]:
         form: wp.array[wp.vec2i]  # bits of the faces on the body's surface (−x, +x, −y, ...), index of its matrices
-        box: wp.array2d[dtype]  # half sides [m], and (μ − 1)/(μ + 1) at the last forces, shape [cells, 4]
-        neighbor: wp.array2d[int]  # index of the neighbor on each side, less that of the cell, shape [cells, 6]
-        weight: wp.array2d[dtype]  # weights of a cell and of its neighbors in its differences, shape [cells, 12]
+        half: wp.array2d[dtype]  # half sides [m], shape [rows, 3]
+        neighbor: wp.array2d[int]  # index of the neighbor on each side, less that of the cell, shape [rows, 6]
+        weight: wp.array2d[dtype]  # weights of a cell and of its neighbors in its differences, shape [rows, 12]
+        # Cells, shape [cells]:
+        row: wp.array[int]  # row of the cell in the arrays of shapes
+        cell: wp.array[wp.vec4i]  # moment, index of its body in ``rotation``, range of permanent bodies
+        factor: wp.array[dtype]  # (μ − 1)/(μ + 1) of near cells at the last forces
         active: wp.array[int]  # on a GPU the number of cells that are evaluated, then these; None for all
         # Bodies, shape [bodies]:
         rotation: wp.array[quaternion]  # from each body's frame to the world
@@ -102,12 +105,12 @@ def _axes(rotation: np.ndarray) -> np.ndarray:
 
 
 def _table(coupling, kind: int, scalar) -> dict[str, np.ndarray]:
-    """Return the arrays of the cells of the ``kind``-th shape, by their names in :func:`cell_arrays_type`."""
+    """Return the rows of the cells of the ``kind``-th shape, by the names of arrays in :func:`cell_arrays_type`."""
     count = len(coupling.radii)
     bits = coupling.outer_faces @ (1 << np.arange(6))
     return {
         "form": np.column_stack([bits, np.full(count, kind)]).astype(np.int32),
-        "box": np.column_stack([coupling.half_sides, np.zeros(count)]).astype(scalar),
+        "half": coupling.half_sides.astype(scalar),
         "neighbor": (coupling.neighbor - np.arange(count)[:, None]).astype(np.int32),
         "weight": coupling.weights.astype(scalar),
     }
@@ -132,19 +135,21 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solids, so
 
     numbers = sorted((k for k, body in enumerate(bodies) if body is not None), key=lambda k: bodies[k].first)
     used = [bodies[number] for number in numbers]
-    # bodies of many worlds have few shapes: cells are gathered from one table for each shape
+    # bodies of many worlds have few shapes
     of_shape = {id(body.coupling): body for body in used}
     kinds, shapes = {key: k for k, key in enumerate(of_shape)}, list(of_shape.values())
     kind = np.array([kinds[id(body.coupling)] for body in used])
     tables = [_table(body.coupling, k, wp.dtype_to_numpy(dtype)) for k, body in enumerate(shapes)]
     sizes = np.array([len(table["form"]) for table in tables])
     counts, begins = sizes[kind], (np.cumsum(sizes) - sizes)[kind]
-    within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    row, moments = within + np.repeat(begins, counts), within + np.repeat([body.first for body in used], counts)
-    for name, warp_type in (("form", wp.vec2i), ("box", dtype), ("neighbor", wp.int32), ("weight", dtype)):
-        setattr(arrays, name, put(np.concatenate([table[name] for table in tables])[row], warp_type))
-    columns = moments, np.repeat(numbers, counts), *solid_ranges[moments].T
-    arrays.cell = put(np.stack([column.astype(np.int32) for column in columns], axis=1), wp.vec4i)
+    for name, warp_type in (("form", wp.vec2i), ("half", dtype), ("neighbor", wp.int32), ("weight", dtype)):
+        setattr(arrays, name, put(np.concatenate([table[name] for table in tables]), warp_type))
+    firsts = np.array([body.first for body in used])
+    of_bodies = np.column_stack([begins, firsts, numbers, solid_ranges[firsts]]).astype(np.int32)
+    of_bodies[:, :2] -= (np.cumsum(counts) - counts).astype(np.int32)[:, None]  # rows and moments count up in a body
+    cells = np.repeat(of_bodies, counts, axis=0)
+    cells[:, :2] += np.arange(len(cells), dtype=np.int32)[:, None]
+    arrays.row, arrays.cell = put(cells[:, 0]), put(cells[:, 1:], wp.vec4i)
     grids = np.zeros((len(bodies), 9))
     grids[numbers] = np.array([_axes(body.coupling.grid_rotation) for body in shapes])[kind]
     arrays.grid, arrays.rotation, arrays.point = put(grids, dtype), rotations, put(unit_points().ravel(), dtype)
@@ -154,13 +159,14 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solids, so
     arrays.cylinder = put([end - len(p) if len(p) else -1 for end, p in zip(ends, potentials, strict=True)])
     arrays.cylinders = put(np.concatenate(potentials), dtype)
     arrays.movable = put(movable)
-    arrays.wrench = wp.empty((len(row), 6), dtype=dtype, device=device)
-    arrays.near = wp.zeros(len(row), dtype=wp.int32, device=device)
+    arrays.wrench = wp.empty((len(cells), 6), dtype=dtype, device=device)
+    arrays.near = wp.zeros(len(cells), dtype=wp.int32, device=device)
+    arrays.factor = wp.zeros(len(cells), dtype=dtype, device=device)
     arrays.change, arrays.steepness = (
-        wp.zeros(len(row), dtype=wp.types.vector(3, dtype), device=device) for _ in range(2)
+        wp.zeros(len(cells), dtype=wp.types.vector(3, dtype), device=device) for _ in range(2)
     )
     # large, and read only where a pass has written it before: zeros would take longer than all else on a CPU
-    arrays.potential = wp.empty(len(row) * 6 * FACE_POINTS, dtype=dtype, device=device)
+    arrays.potential = wp.empty(len(cells) * 6 * FACE_POINTS, dtype=dtype, device=device)
 
 
 @cache
@@ -189,7 +195,7 @@ def _image_factor_kernel(dtype):
         reduced = wp.length(moments[i]) / (volume * saturation[i])
         s = inverse_curve_ratio(reduced, k, curve[i], tables) * reduced
         steep = k * curve_slope(s, k, curve[i], tables)
-        cells.box[c, 3] = steep / (dtype(2.0) + steep / dtype(3.0))
+        cells.factor[c] = steep / (dtype(2.0) + steep / dtype(3.0))
 
     return write_image_factors
 
@@ -204,7 +210,7 @@ def launch_image_factors(arrays, moments, radii, material):
         material: Their curves (``material.curves.CurveParameters``).
     """
     values = moments, radii, material.saturation, material.slope, material.curve, material.tables
-    kernel = _image_factor_kernel(arrays.box.dtype)
+    kernel = _image_factor_kernel(arrays.factor.dtype)
     most = most_blocks(moments.device) if arrays.active else 0
     wp.launch(kernel, arrays.cell.shape[0], inputs=[*values, arrays], max_blocks=most, device=moments.device)
 
@@ -212,7 +218,7 @@ def launch_image_factors(arrays, moments, radii, material):
 def energies(arrays) -> np.ndarray:
     """Return the energies over μ0 of the charges on the faces of cells, −½ φᵀ R φ, shape [cells]."""
     near = np.flatnonzero(arrays.near.numpy() == NEAR)
-    forms, factors = arrays.form.numpy()[near], arrays.box.numpy()[near, 3].astype(float)
+    forms, factors = arrays.form.numpy()[arrays.row.numpy()[near]], arrays.factor.numpy()[near].astype(float)
     potentials = arrays.potential.numpy().reshape(-1, 6, FACE_POINTS)[near].astype(float)
     matrices = arrays.response.numpy().reshape(-1, 3, FACE_POINTS, FACE_POINTS)[forms[:, 1]].astype(float)
     of_faces = np.einsum("cfi,cfij,cfj->cf", potentials, np.repeat(matrices, 2, axis=1), potentials)

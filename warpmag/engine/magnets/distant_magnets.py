@@ -158,15 +158,13 @@ class DistantMagnets:
         arrays.pattern_count = put(pattern_counts, wp.int32)
         arrays.strengths = wp.zeros((len(records), max(pattern_counts)), dtype=float, device=self._model.device)
         many = self._cells
-        number = {k: row for row, k in enumerate(indices)}
-        source, cell = np.full(len(many.volumes), -1), np.full((len(many.volumes), 2), -1)
-        for k, magnet in enumerate(many.magnets):
-            own = slice(many.first[k], many.first[k + 1])
-            count = len(magnet.lattice.volumes)
-            if k in bodies:
-                cell[own] = np.stack([np.full(count, number[k]), np.arange(count)], axis=1)
-            else:
-                source[own] = first[k] + np.arange(count)
+        numbers = np.full(len(magnets), -1, np.int32)
+        numbers[indices] = np.arange(len(indices))
+        counts = np.diff(many.first)
+        within = np.arange(many.first[-1], dtype=np.int32) - np.repeat(many.first[:-1].astype(np.int32), counts)
+        number = np.repeat(numbers, counts)
+        source = np.where(number < 0, np.repeat(first[:-1].astype(np.int32), counts) + within, np.int32(-1))
+        cell = np.stack([number, np.where(number < 0, np.int32(-1), within)], axis=1)
         coupled = [k for k, magnet in enumerate(many.magnets) if magnet.lattice.coupling is not None]
         arrays.rotation = put(np.searchsorted(coupled, indices), wp.int32)
         arrays.same = put(_matching_moments(first, many.first), wp.int32)
@@ -261,8 +259,11 @@ class DistantMagnets:
 
 def _replaced(magnets: list[BodyMagnet], bodies: dict[int, DistantBody]) -> list[BodyMagnet]:
     """Return the magnets with few moments in place of the cells of ``bodies``."""
+    # many worlds share one lattice
+    kinds = {(id(body), len(magnets[k].shapes)): body for k, body in bodies.items()}
+    lattices = {(key, count): _few(body, count) for (key, count), body in kinds.items()}
     return [
-        replace(magnet, lattice=_few(bodies[k], len(magnet.shapes))) if k in bodies else magnet
+        replace(magnet, lattice=lattices[id(bodies[k]), len(magnet.shapes)]) if k in bodies else magnet
         for k, magnet in enumerate(magnets)
     ]
 
