@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
 from bench.reference import boxes, oracle
@@ -12,6 +13,14 @@ from warpmag.shapes import demagnetization, lattice, linear_cells, uniform_respo
 
 FAINT = 1e12  # A/m, a saturation far above any field here
 TURN = np.array([0.2, -0.4, 0.1, 0.8]) / np.linalg.norm([0.2, -0.4, 0.1, 0.8])
+
+
+def demagnetizing_factors(semi_axes):
+    """Demagnetizing factors of an ellipsoid (Osborn 1945), by numerical integration."""
+    a = np.asarray(semi_axes, float)
+    return np.array(
+        [a.prod() / 2 * quad(lambda s, x=x: 1 / ((s + x * x) * np.sqrt((s + a * a).prod())), 0, np.inf)[0] for x in a]
+    )
 
 
 def full(six):

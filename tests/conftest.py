@@ -22,7 +22,7 @@ QUICK = {
     *("eddy", "translation", "applied", "baseline_dynamics", "system", "cells_compound", "coils"),
     *("engine_attributes", "engine_magnetics", "engine_simulation", "engine_xpbd", "stepping", "balls", "broad_phase"),
     *("ball_contacts", "coulomb", "near_contact_extremes", "usd_schemas", "usd_reader", "usd_crate", "usd_output"),
-    *("export", "viewers", "observables"),
+    *("usd_output_files", "export", "viewers", "observables"),
 }
 """Files of tests marked ``quick``: every room, in under a minute on two cores with compiled kernels."""
 SANITIZERS = {

@@ -110,7 +110,7 @@ def test_ended_at_any_write_the_stage_has_all_frames(tmp_path, stage, monkeypatc
             assert not output.exists()
 
 
-def test_a_frame_that_found_no_room_can_be_added_again(tmp_path, stage, monkeypatch):
+def test_a_frame_can_be_added_again_after_a_full_disk(tmp_path, stage, monkeypatch):
     """Whichever write failed: of the second frame, with which samples begin, or of one that makes the file longer."""
     frames, write, count, missing, spans = make_frames(67), os.pwrite, 0, 0, {}
 
@@ -142,7 +142,7 @@ def test_a_frame_that_found_no_room_can_be_added_again(tmp_path, stage, monkeypa
         run(tmp_path / f"{number}" / "run.usda")
 
 
-def test_a_run_goes_on_where_it_was(tmp_path, stage, monkeypatch):
+def test_a_run_continues_where_it_ended(tmp_path, stage, monkeypatch):
     """Frames that came after the checkpoint are dropped, and those that are added grow the file."""
     monkeypatch.setattr("warpmag.usd.write.writer._CHECKPOINT_SECONDS", 0.0)
     monkeypatch.setattr("warpmag.usd.write.writer._CHECKPOINT_SHARE", 1e9)
@@ -184,7 +184,7 @@ def test_a_cache_that_is_cut_off_is_refused_in_one_line(tmp_path, stage, complet
     writer.close(complete=complete)
 
 
-def test_a_checkpoint_that_is_none_is_refused_in_one_line(tmp_path, stage):
+def test_an_invalid_checkpoint_is_refused_in_one_line(tmp_path, stage):
     output = tmp_path / "run.usda"
     for content in (b"", b"nonsense", b"PK\x03\x04 cut off"):
         (tmp_path / "run.resume.npz").write_bytes(content)
@@ -258,7 +258,7 @@ def test_a_run_whose_cache_was_cut_is_refused_in_one_line(begun, stage):
         CacheWriter(stage, output, PATHS, PATHS).resume()
 
 
-def test_what_is_no_run_is_not_resumed(tmp_path, stage):
+def test_a_stage_without_a_run_is_not_resumed(tmp_path, stage):
     output = tmp_path / "run.usda"
     output.write_text("#usda 1.0\n")
     with pytest.raises(InputError, match=r"run\.usda: nothing to resume"):
@@ -293,6 +293,6 @@ print(write("many", 2500))
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="reads the memory of a process as Linux tells it")
-def test_what_usd_took_to_write_a_layer_is_given_back(tmp_path):
+def test_memory_of_a_written_layer_is_freed(tmp_path):
     done = subprocess.run([sys.executable, "-c", MEMORY, tmp_path], capture_output=True, text=True, check=True)
     assert float(done.stdout) < 16.0  # MiB, of which the values of two frames are 0.6; 25 to 33 where nothing is given

@@ -19,7 +19,7 @@ def stage(tmp_path):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Who else is there
+# Other runs, other files
 # ---------------------------------------------------------------------------------------------------------------------
 
 
@@ -37,7 +37,7 @@ def test_two_runs_with_one_output(tmp_path, stage):
         add(second, frames, [0])
 
 
-def test_what_a_killed_run_leaves_is_in_nobodys_way(tmp_path, stage):
+def test_files_of_a_killed_run_do_not_disturb_the_next(tmp_path, stage):
     script = (
         "import sys, time, numpy as np\n"
         "from warpmag.usd import CacheWriter, open_stage\n"
@@ -59,7 +59,7 @@ def test_what_a_killed_run_leaves_is_in_nobodys_way(tmp_path, stage):
     assert sorted(os.listdir(output.parent)) == ["run.cache.usdc", "run.usda"]
 
 
-def test_links_that_somebody_planted_are_not_followed(tmp_path, stage):
+def test_planted_links_are_not_followed(tmp_path, stage):
     victim, folder = tmp_path / "victim", tmp_path / "out"
     victim.write_text("precious")
     folder.mkdir()
@@ -148,7 +148,7 @@ REFUSED = ["a\nb", "a\\b", "a\tb", "a\x7fb", "a\udcffb", "a:SDF_FORMAT_ARGS:b=c"
 
 
 @pytest.mark.parametrize("name", ODD)
-def test_odd_names_are_right(tmp_path, monkeypatch, name):
+def test_odd_names_work(tmp_path, monkeypatch, name):
     folder = tmp_path / name
     folder.mkdir()
     (folder / f"{name}.usda").write_text(SCENE)
@@ -160,7 +160,7 @@ def test_odd_names_are_right(tmp_path, monkeypatch, name):
 
 
 @pytest.mark.parametrize("name", REFUSED, ids=range(len(REFUSED)))
-def test_names_that_cannot_be_are_refused_in_one_line(tmp_path, stage, name):
+def test_impossible_names_are_refused_in_one_line(tmp_path, stage, name):
     refusals = [lambda: CacheWriter(stage, tmp_path / f"{name}.usda", [], [])]
     if len(name) not in (250, 252):  # there may be such a scene
         refusals.append(lambda: open_stage(tmp_path / f"{name}.usda"))

@@ -77,9 +77,7 @@ def export(
     magnets = MagnetOverlays(render) if color or arrows or field_lines else None
     shades = None
     if magnets and color:
-        values = magnets.values(color, device)
-        top = float(np.quantile(values, _TOP)) or 1.0
-        shades = np.clip(values / top, 0.0, 1.0)
+        shades, top = _shades(magnets.values(color, device))
         notes.append(f"color          {color}, from 0 to {top:.3g} {COLORS[color]}")
     render.add_bodies(shades)
     if magnets and arrows:
@@ -88,6 +86,12 @@ def export(
         render.add_lines(*magnets.field_lines(field_lines, device))
     render.save(output, materialx=materialx)
     return notes
+
+
+def _shades(values: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return values scaled to the range from 0 to 1, and the value that becomes 1."""
+    top = float(np.quantile(values, _TOP)) or 1.0
+    return np.clip(values / top, 0.0, 1.0), top
 
 
 def _write_numbers(stage: str | os.PathLike, path: Path) -> None:

@@ -15,6 +15,7 @@ from warpmag.declarations.magnets import MagneticSettings, check_magnetization
 from warpmag.deprecation import renamed_arguments
 from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.caller_checks import check_duration, check_state, held_by_model
+from warpmag.engine.magnets.caller_values import device_vectors, world_indices
 from warpmag.engine.magnets.distant_magnets import DistantMagnets, distant_bodies
 from warpmag.engine.magnets.eddy import gather_velocities, set_conductivities
 from warpmag.engine.magnets.grouping import BodyMagnet, find_magnets
@@ -34,7 +35,6 @@ from warpmag.kernels.rigid.bodies import (
 from warpmag.moments.arrays import (
     CallContext,
     Numbers,
-    check_warp_array,
     host_array,
     largest_coordinate,
     restore_snapshot,
@@ -395,7 +395,8 @@ class Magnetics:
         Raises:
             InputError: The field has another shape, or is not finite.
         """
-        field = self._vectors("external_field", external_field, (1, max(self._model.world_count, 1)))
+        counts = 1, max(self._model.world_count, 1)
+        field = device_vectors("external_field", external_field, counts, self._model.device)
         set_external_field(field, self._newton_world, self.system.external_field)
 
     def set_current(self, coil: int | str, ampere_turns: Numbers) -> None:
@@ -455,20 +456,8 @@ class Magnetics:
             if magnetization.shape == (3,):
                 check_magnetization("magnetization", magnetization)
         shapes = self._permanent_shapes.select(body, shape)
-        set_magnetization(self._vectors("magnetization", magnetization, (1,)), shapes, self._model, self._placed.table)
-
-    def _vectors(self, name: str, value, counts: tuple[int, ...]) -> wp.array:
-        """Return ``value`` as an array of vectors on the model's device; its length must be one of ``counts``."""
-        if isinstance(value, wp.array):  # values are not read: this may run in a graph capture
-            check_warp_array(name, value, wp.vec3, self._model.device)
-            vectors = value
-        else:
-            context = CallContext(wp.get_device(self._model.device), wp.float32, warp_out=False)
-            vectors = context.vectors(name, np.atleast_2d(host_array(name, value)))
-        if len(vectors) not in counts:
-            allowed = " or ".join(f"[{count}, 3]" for count in dict.fromkeys(counts))
-            raise InputError(f"{name}: shape must be [3] or {allowed}, got {list(np.shape(value))}")
-        return vectors
+        vector = device_vectors("magnetization", magnetization, (1,), self._model.device)
+        set_magnetization(vector, shapes, self._model, self._placed.table)
 
     def probe(self, points: Numbers, *, worlds: npt.ArrayLike | None = None, gradients: bool = False) -> FieldProbe:
         """Return a probe of the field at points; its :meth:`FieldProbe.measure` is capturable in a graph::
@@ -490,25 +479,10 @@ class Magnetics:
         largest = max(float(magnet.lattice.radii.max()) for magnet in self.magnets)
         context = CallContext(self.system.device, self.system.dtype, warp_out=False)
         points = context.vectors("points", points, farthest=largest_coordinate(self.system.dtype, largest))
-        indices = self._world_indices(worlds, len(points))
+        indices = world_indices(worlds, self._worlds, len(points))
         probe = FieldProbe(self.system, len(points), worlds=indices, gradients=gradients)
         wp.copy(probe.points, points)
         return probe
-
-    def _world_indices(self, worlds, count: int) -> np.ndarray:
-        """Return the index of each point's world among the worlds with magnets, shape [count]."""
-        if worlds is None:
-            if len(self._worlds) > 1:
-                raise InputError(f"worlds: must be given, {len(self._worlds)} worlds hold magnets")
-            return np.zeros(count, int)
-        numbers = host_array("worlds", worlds)
-        worlds = numbers.astype(int) if (np.abs(numbers) < 2**31).all() else np.full(numbers.shape, -1)
-        if (worlds != numbers).any() or worlds.shape not in ((), (count,)):
-            raise InputError(f"worlds: must be whole numbers, one or {count}, got {short_repr(numbers.tolist())}")
-        unknown = worlds[~np.isin(worlds, self._worlds)]
-        if unknown.size:
-            raise InputError(f"worlds: world {unknown.flat[0]} holds no magnets")
-        return np.broadcast_to(np.searchsorted(self._worlds, worlds), count)
 
     def h_field(self, points: Numbers, *, worlds: npt.ArrayLike | None = None) -> np.ndarray:
         """Return the field H [A/m] at points, shape [p, 3]; see :meth:`probe` for arguments and errors."""
