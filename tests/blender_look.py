@@ -10,7 +10,7 @@ def places(scene, frame):
     """Where instances are at a frame."""
     scene.frame_set(frame)
     shown = bpy.context.evaluated_depsgraph_get().object_instances
-    return [list(one.matrix_world.translation) for one in shown if one.is_instance]
+    return [list(entry.matrix_world.translation) for entry in shown if entry.is_instance]
 
 
 def brightness(path):
@@ -24,18 +24,20 @@ def brightness(path):
 def main(stage, picture):
     """Look at all of it."""
     bpy.ops.wm.read_factory_settings()
-    for one in list(bpy.data.objects):
-        bpy.data.objects.remove(one)
+    for entry in list(bpy.data.objects):
+        bpy.data.objects.remove(entry)
     bpy.ops.wm.usd_import(filepath=stage)
     scene, objects = bpy.context.scene, list(bpy.data.objects)
-    cameras = [one for one in objects if one.type == "CAMERA"]
-    meshes = [one for one in objects if one.type == "MESH"]
-    found = {
+    cameras = [entry for entry in objects if entry.type == "CAMERA"]
+    meshes = [entry for entry in objects if entry.type == "MESH"]
+    result = {
         "range": [scene.frame_start, scene.frame_end],
         "unit": scene.unit_settings.scale_length,
         "camera": len(cameras),
-        "lights": sum(one.type == "LIGHT" for one in objects),
-        "without_material": [one.name for one in meshes if not (one.material_slots and one.material_slots[0].material)],
+        "lights": sum(entry.type == "LIGHT" for entry in objects),
+        "without_material": [
+            entry.name for entry in meshes if not (entry.material_slots and entry.material_slots[0].material)
+        ],
         "first": places(scene, scene.frame_start),
         "last": places(scene, scene.frame_end),
     }
@@ -45,8 +47,8 @@ def main(stage, picture):
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 160, 90, 100
     scene.render.filepath = picture
     bpy.ops.render.render(write_still=True)
-    found["brightness"] = brightness(picture)
-    print(json.dumps(found))
+    result["brightness"] = brightness(picture)
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":

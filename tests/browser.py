@@ -75,7 +75,7 @@ def shown(path, folder, size=(500, 300)):
             assert browser.poll() is None and time.monotonic() < end, "the browser does not start"
             time.sleep(0.05)
         with urllib.request.urlopen(f"http://127.0.0.1:{port.read_text().split()[0]}/json", timeout=_START) as tabs:
-            (tab,) = [one for one in json.load(tabs) if one["type"] == "page"]
+            (tab,) = [entry for entry in json.load(tabs) if entry["type"] == "page"]
         with connect(tab["webSocketDebuggerUrl"], max_size=None, ping_interval=None) as socket:
             page = Page(socket)
             page.call("Page.navigate", url=Path(path).resolve().as_uri())

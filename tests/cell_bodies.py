@@ -59,13 +59,13 @@ def make_system(body, *, turn=(0.0, 0.0, 0.0, 1.0), permanent=(), coupling=None,
 
 def polarizability(body, susceptibility, device, **settings):
     """Moment over V H0 along x and along z, shape [2]."""
-    found = []
+    results = []
     for axis in np.eye(3)[[0, 2]]:
         system = make_system(body, susceptibility=susceptibility, external_field=1e3 * axis, device=device, **settings)
         system.solve()
         assert system.converged.numpy().all()
-        found.append(system.moments.numpy().sum(axis=0) @ axis / (1e3 * body.volumes.sum()))
-    return np.array(found)
+        results.append(system.moments.numpy().sum(axis=0) @ axis / (1e3 * body.volumes.sum()))
+    return np.array(results)
 
 
 def demagnetizing_matrix(body, coupling=None):

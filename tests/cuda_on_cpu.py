@@ -144,10 +144,10 @@ def start():
     """Let the CPU stand in for a GPU."""
     wp.init()
     look_like_cuda()
-    run, one = context.invoke_cpu_blocks, threading.Lock()
+    run, first = context.invoke_cpu_blocks, threading.Lock()
 
     def run_alone(*arguments):
-        with one:  # shared memory is there once
+        with first:  # shared memory is there once
             run(*arguments)
 
     context.invoke_cpu_blocks = run_alone

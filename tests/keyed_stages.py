@@ -41,7 +41,7 @@ KINEMATIC = "bool physics:kinematicEnabled = 1"
 
 
 def prim(kind, name, apis, *lines):
-    quoted = ", ".join(f'"{one}"' for one in (*apis, "MaterialBindingAPI", "PhysicsMassAPI"))
+    quoted = ", ".join(f'"{entry}"' for entry in (*apis, "MaterialBindingAPI", "PhysicsMassAPI"))
     inner = "\n".join(("rel material:binding = </World/Rough>", *lines))
     return f'def {kind} "{name}" (prepend apiSchemas = [{quoted}])\n{{\n{inner}\n}}\n'
 
@@ -69,14 +69,14 @@ def operations(**given):
 
 def text(value):
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{time:.17g}: {one}" for time, one in value.items()) + " }"
+        return "{ " + ", ".join(f"{time:.17g}: {entry}" for time, entry in value.items()) + " }"
     return str(value)
 
 
 def write(folder, *bodies, scene="", gravity=0.0, start=0, name="scene.usda"):
     path = folder / name
-    found = HEAD.replace("START", str(start)).replace("GRAVITY", str(gravity)).replace("SCENE", scene)
-    path.write_text(found.replace("BODIES", "\n".join(bodies)))
+    result = HEAD.replace("START", str(start)).replace("GRAVITY", str(gravity)).replace("SCENE", scene)
+    path.write_text(result.replace("BODIES", "\n".join(bodies)))
     return path
 
 

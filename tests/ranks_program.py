@@ -113,10 +113,10 @@ def sweeps(place: str | None) -> dict[str, np.ndarray]:
             simulation.step()
         return simulation.state.body_q.numpy().reshape(len(worlds), -1, 7)
 
-    found = warpmag.sweep(poses, len(fields), together=2)
-    assert [len(one) for one in found] == [2, 2, 1]
+    result = warpmag.sweep(poses, len(fields), together=2)
+    assert [len(entry) for entry in result] == [2, 2, 1]
     sizes = warpmag.sweep(lambda worlds: several_worlds([40 + world for world in worlds], place), 3, together=1)
-    return {"sweep": np.concatenate(found), "sweep of arrays": np.concatenate(sizes)}
+    return {"sweep": np.concatenate(result), "sweep of arrays": np.concatenate(sizes)}
 
 
 def small_scene(saturation: float = 1e6, worlds: int = 1) -> newton.ModelBuilder:

@@ -39,12 +39,12 @@ def call(name, device, /, **arguments):
     arguments = {**CALLS[name], "device": device, **arguments}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", warpmag.errors.ConvergenceWarning)
-        found = getattr(warpmag, name)(**arguments)
+        result = getattr(warpmag, name)(**arguments)
         if name == "h_field":
-            return [found]
+            return [result]
         if name == "wrench":
-            return list(found)
-        return [found.magnetizations, found.h_field, *found.wrench()]
+            return list(result)
+        return [result.magnetizations, result.h_field, *result.wrench()]
 
 
 def refused(name, device, match, /, **arguments):
@@ -170,8 +170,8 @@ def test_out_of_range(name, arguments, message, device):
     x, m = arguments["positions"], arguments["moments"]
     h = oracle.h_field(x, m)
     expected = [h] if name == "h_field" else [oracle.kelvin_force(m, oracle.field_gradient(x, m)), oracle.torque(m, h)]
-    for found, value in zip(call(name, device, **arguments), expected, strict=True):
-        assert np.abs(found - value).max() <= 1e-5 * np.abs(value).max()
+    for actual, value in zip(call(name, device, **arguments), expected, strict=True):
+        assert np.abs(actual - value).max() <= 1e-5 * np.abs(value).max()
 
 
 GUISES = {
@@ -196,8 +196,8 @@ def test_guises_of_the_same_numbers(name, guise, device):
         key: GUISES[guise](np.asarray(value, float)) if np.ndim(value) == 2 else value
         for key, value in CALLS[name].items()
     }
-    for found, expected in zip(call(name, device, **arguments), call(name, device), strict=True):
-        assert np.array_equal(found, expected)
+    for actual, expected in zip(call(name, device, **arguments), call(name, device), strict=True):
+        assert np.array_equal(actual, expected)
 
 
 @pytest.mark.parametrize("integer", [int, np.int64, np.uint32, np.array, lambda n: np.full(3, n), lambda n: [n] * 3])
@@ -209,11 +209,11 @@ def test_integers_are_numbers(integer, device):
         "initial": (0, 0, 1),
         "permanent": ([[9, 9, 9]], [[1, 2, 3]]),
     }
-    found = call("solve_induction", device, radii=integer(1), saturation=integer(1_700_000), **given)
+    result = call("solve_induction", device, radii=integer(1), saturation=integer(1_700_000), **given)
     given = {key: np.asarray(value, float) for key, value in given.items() if key != "permanent"}
     given["permanent"] = (np.full((1, 3), 9.0), np.array([[1.0, 2.0, 3.0]]))
-    for one, other in zip(found, call("solve_induction", device, radii=1.0, saturation=1.7e6, **given), strict=True):
-        assert np.array_equal(one, other)
+    for entry, other in zip(result, call("solve_induction", device, radii=1.0, saturation=1.7e6, **given), strict=True):
+        assert np.array_equal(entry, other)
 
 
 def test_half_precision_is_read_as_it_is(device):
@@ -237,9 +237,9 @@ def test_warp_arrays(device):
     every = warp_vectors(np.repeat(X, 2, axis=0), device)
     chosen = every[wp.array([0, 2, 4], dtype=int, device=device)]
     for x in (warp_vectors(X, device), every[::2], chosen, warp_vectors(X, device, wp.vec3d)):
-        found = call("wrench", device, positions=x, moments=warp_vectors(M, device))
-        for one, other in zip(found, expected, strict=True):
-            assert isinstance(one, wp.array) and np.array_equal(one.numpy(), other)
+        actual = call("wrench", device, positions=x, moments=warp_vectors(M, device))
+        for entry, other in zip(actual, expected, strict=True):
+            assert isinstance(entry, wp.array) and np.array_equal(entry.numpy(), other)
     for value, message in (
         (warp_vectors(X * np.nan, device), r"contains NaN \(row 0\)"),
         (warp_vectors(np.where(X > 0.015, np.inf, X), device), r"not finite in float32 \(row 2\)"),
@@ -268,8 +268,8 @@ def test_sources_is_a_deprecated_name(device):
     dipole = [[0.0, 0.0, 0.05]], [[0.0, 0.0, 1.0]]
     expected = call("solve_induction", device, permanent=dipole)
     with pytest.warns(DeprecationWarning, match="sources is deprecated, use permanent"):
-        found = warpmag.solve_induction(**CALLS["solve_induction"], sources=dipole, device=device)
-    assert np.array_equal(found.magnetizations, expected[0])
+        actual = warpmag.solve_induction(**CALLS["solve_induction"], sources=dipole, device=device)
+    assert np.array_equal(actual.magnetizations, expected[0])
 
 
 @pytest.mark.parametrize("gap", [-0.02, 0.05, 0.3])
@@ -279,8 +279,8 @@ def test_permanent_moment_beside_near_contacts(gap, device):
     arguments = {"positions": x, "contact_model": "multipole", "rtol": 1e-5}
     alone = call("solve_induction", device, **arguments)
     beside = call("solve_induction", device, permanent=([[1e3, 0.0, 0.0]], [[1.0, 0.0, 0.0]]), **arguments)
-    for one, other in zip(beside, alone, strict=True):
-        assert np.abs(one - other).max() <= 1e-4 * max(np.abs(other).max(), 1e-4)
+    for entry, other in zip(beside, alone, strict=True):
+        assert np.abs(entry - other).max() <= 1e-4 * max(np.abs(other).max(), 1e-4)
 
 
 @pytest.mark.parametrize(

@@ -54,12 +54,12 @@ def single(values, dtype):
 def outcome(name, device, /, **arguments):
     """What a call returned, None where it was refused; anything else fails."""
     try:
-        found = call(name, device, **arguments)
+        result = call(name, device, **arguments)
     except warpmag.InputError as error:
         assert ": " in str(error) and "\n" not in str(error)
         return None
-    assert all(np.isfinite(one).all() for one in found)
-    return found
+    assert all(np.isfinite(entry).all() for entry in result)
+    return result
 
 
 def scales(x, m, radii):
@@ -117,14 +117,14 @@ def test_any_induction(device, arrangement, field, strength, guise, dtype, besid
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", warpmag.errors.ConvergenceWarning)
-            found = warpmag.solve_induction(**arguments, dtype=dtype, device=device, max_evaluations=200)
-            forces = found.wrench()
+            actual = warpmag.solve_induction(**arguments, dtype=dtype, device=device, max_evaluations=200)
+            forces = actual.wrench()
     except warpmag.InputError as error:
         assert ": " in str(error) and "\n" not in str(error)
         return
-    m = np.asarray(found.magnetizations, float)
-    assert all(np.isfinite(one).all() for one in (m, found.h_field, *forces, found.error))
-    if not found.converged:
+    m = np.asarray(actual.magnetizations, float)
+    assert all(np.isfinite(entry).all() for entry in (m, actual.h_field, *forces, actual.error))
+    if not actual.converged:
         return
     x, radii = single(x, dtype), np.broadcast_to(single(radii, dtype), len(x))
     h0 += oracle.h_field(x, m * (4.0 / 3.0 * np.pi * radii**3)[:, None], radii=radii)
@@ -199,14 +199,14 @@ def test_any_magnet(name, data):
     arguments |= given
     with refusals():
         getattr(warpmag, name)(**arguments)
-        values = {key: one.values for key, one in arguments["builder"].custom_attributes.items()}
+        values = {key: entry.values for key, entry in arguments["builder"].custom_attributes.items()}
         for key, wanted in given.items():
             if (
                 key in ("saturation", "susceptibility", "moment_spacing", "magnetization", "recoil_permeability")
                 and wanted is not None
             ):
-                (found,) = values[f"warpmag:{key}"].values()
-                assert np.array_equal(np.ravel(found), np.ravel(wanted))
+                (actual,) = values[f"warpmag:{key}"].values()
+                assert np.array_equal(np.ravel(actual), np.ravel(wanted))
 
 
 SETTINGS = "force dynamics contact_model rtol external_field max_evaluations curve"

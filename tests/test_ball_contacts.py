@@ -43,12 +43,12 @@ class Finder:
         columns = [getattr(self.contacts, f"rigid_contact_{name}").numpy()[:count] for name in FIELDS]
         numbers = np.hstack([column.reshape(count, -1) for column in columns])
         shapes = np.stack([getattr(self.contacts, f"rigid_contact_shape{end}").numpy()[:count] for end in (0, 1)], 1)
-        found, seen = {}, Counter()
+        result, seen = {}, Counter()
         for row in np.lexsort((*numbers.T[::-1].round(5), *shapes.T[::-1])):
             key = tuple(shapes[row].tolist())
-            found[*key, seen[key]] = numbers[row]
+            result[*key, seen[key]] = numbers[row]
             seen[key] += 1
-        return found
+        return result
 
     def pairs(self) -> int:
         """Pairs that were left to Newton's narrow phase."""
@@ -117,9 +117,9 @@ def test_boxes_apart_are_left_out(device):
     own, newtons, state = Finder(model, True), Finder(model, False), model.state()
     for speed in (0.0, 1.0, 20.0):
         set_motion(model, state, rng, 0.0, speed)
-        found = own.collide(state)
-        assert found.keys() == newtons.collide(state).keys()
-        touching = len({key[:2] for key in found})
+        result = own.collide(state)
+        assert result.keys() == newtons.collide(state).keys()
+        touching = len({key[:2] for key in result})
         assert 100 < touching <= own.pairs() < newtons.pairs()
         assert speed > 0.0 or own.pairs() < 1.1 * touching < 0.5 * newtons.pairs()
 
@@ -132,10 +132,10 @@ def test_too_many_contacts_are_counted(device):
     model = builder.finalize(device=device)
     state, few = model.state(), Finder(model, True, contact_max=1000)
     newtons, own = Finder(model, False).collide(state), Finder(model, True)
-    found = own.collide(state)
-    assert (found.keys(), own.pairs()) == (newtons.keys(), 0)
-    assert len(found) > 16 * 150
+    result = own.collide(state)
+    assert (result.keys(), own.pairs()) == (newtons.keys(), 0)
+    assert len(result) > 16 * 150
     kept = few.collide(state)
-    assert few.contacts.rigid_contact_count.numpy()[0] == len(found)
+    assert few.contacts.rigid_contact_count.numpy()[0] == len(result)
     assert len(kept) == 1000
-    assert kept.keys() <= found.keys()
+    assert kept.keys() <= result.keys()

@@ -48,7 +48,7 @@ def _finished(builder, world):
 def _fields(thing) -> Iterator[tuple[str, Any]]:
     for name, value in sorted(vars(thing).items()):
         if isinstance(value, newton.Model.AttributeNamespace):
-            yield from ((f"{name}.{inner}", one) for inner, one in _fields(value))
+            yield from ((f"{name}.{inner}", entry) for inner, entry in _fields(value))
         elif isinstance(value, wp.array):
             yield name, value.numpy()
         elif isinstance(value, (list, dict, tuple, set, int, float, str, wp.vec3, np.ndarray, type(None))):
@@ -77,13 +77,13 @@ def test_model_is_that_of_newtons_own_calls(world, several, permanent):
     places, turns = _poses()
     radii = np.array([0.004, 0.005, 0.004, 0.007, 0.004, 0.005, 0.006]) if several else np.full(COUNT, 0.005)
     given = {"magnetization": (1e5, 0.0, 2e5)} if permanent else {"saturation": 1.1e6, "susceptibility": 40.0}
-    one, many = _builder(world=world), _builder(world=world)
-    cfg = one.default_shape_cfg.copy()
+    first, many = _builder(world=world), _builder(world=world)
+    cfg = first.default_shape_cfg.copy()
     cfg.density, cfg.mu = 7870.0, 0.3
     for number, (place, turn, radius) in enumerate(zip(places, turns, radii, strict=True)):
-        body = one.add_body(xform=wp.transform(place, turn), label=f"ball_{number}")
-        one.add_shape_sphere(body, radius=radius, cfg=cfg, color=(0.1, 0.2, 0.3), label=f"ball_{number}_shape")
-        (warpmag.add_permanent if permanent else warpmag.add_inducible)(one, body=body, **given)
+        body = first.add_body(xform=wp.transform(place, turn), label=f"ball_{number}")
+        first.add_shape_sphere(body, radius=radius, cfg=cfg, color=(0.1, 0.2, 0.3), label=f"ball_{number}_shape")
+        (warpmag.add_permanent if permanent else warpmag.add_inducible)(first, body=body, **given)
     added = warpmag.add_balls(
         *(many, places, radii if several else 0.005),
         orientations=turns,
@@ -94,24 +94,24 @@ def test_model_is_that_of_newtons_own_calls(world, several, permanent):
         **given,
     )
     assert added == warpmag.Balls(range(1, 1 + COUNT), range(1, 1 + COUNT))
-    assert _same(_finished(many, world), _finished(one, world)) > 150
+    assert _same(_finished(many, world), _finished(first, world)) > 150
 
 
 def test_nothing_said_is_as_newton_has_it():
-    one, many = _builder(), _builder()
+    first, many = _builder(), _builder()
     places, _ = _poses()
     for place in places:
-        body = one.add_body(xform=wp.transform(place, wp.quat_identity()))
-        one.add_shape_sphere(body, radius=0.005, color=(0.5, 0.5, 0.5))
-        warpmag.add_inducible(one, body=body)
+        body = first.add_body(xform=wp.transform(place, wp.quat_identity()))
+        first.add_shape_sphere(body, radius=0.005, color=(0.5, 0.5, 0.5))
+        warpmag.add_inducible(first, body=body)
     warpmag.add_balls(many, places, 0.005, color=(0.5, 0.5, 0.5))
-    _same(_finished(many, False), _finished(one, False))
+    _same(_finished(many, False), _finished(first, False))
 
 
 def test_none_is_none():
-    one, many = _builder(), _builder()
+    first, many = _builder(), _builder()
     assert warpmag.add_balls(many, np.zeros((0, 3)), 0.005).bodies == range(1, 1)
-    _same(_finished(many, False), _finished(one, False))
+    _same(_finished(many, False), _finished(first, False))
 
 
 @pytest.mark.parametrize(
@@ -200,9 +200,9 @@ def test_sizes_of_bodies_are_those_of_their_shapes():
     builder.add_shape_sphere(builder.add_body(), radius=0.2)
     builder.add_ground_plane()
     model = builder.finalize(device="cpu")
-    found = body_sizes(model)
+    result = body_sizes(model)
     scales, middles = model.shape_scale.numpy(), model.shape_transform.numpy()[:, :3]
-    sizes = [_size_of(*one) for one in zip(model.shape_type.numpy(), scales, model.shape_source, strict=True)]
+    sizes = [_size_of(*entry) for entry in zip(model.shape_type.numpy(), scales, model.shape_source, strict=True)]
     thickness, reach = np.full(model.body_count, np.inf), np.zeros(model.body_count)
     for shape, body in enumerate(model.shape_body.numpy()):
         kinematic = model.body_flags.numpy()[body] & newton.BodyFlags.KINEMATIC
@@ -212,8 +212,8 @@ def test_sizes_of_bodies_are_those_of_their_shapes():
             radius = model.shape_collision_radius.numpy()[shape]
             if far > 1e-3 * radius or model.shape_type.numpy()[shape] != newton.GeoType.SPHERE:
                 reach[body] = max(reach[body], far + radius)
-    np.testing.assert_array_equal(found.thickness, thickness)
-    np.testing.assert_allclose(found.reach, reach, rtol=1e-6)  # single precision
+    np.testing.assert_array_equal(result.thickness, thickness)
+    np.testing.assert_allclose(result.reach, reach, rtol=1e-6)  # single precision
     assert np.isfinite(thickness).sum() > 10 and model.shape_count > 40
 
 

@@ -89,10 +89,10 @@ def test_contacts_are_those_of_all_pairs(worlds, seed, device):
     for shift, speed in ((0.0, 0.0), (1e-3, 0.1), (1e-3, 10.0), (1e-3, 100.0), (0.01, 1.0), (1e-4, 0.0)):
         set_motion(model, state, rng, shift, speed)
         pairs, contacts = newtons.find(state)
-        found, own_contacts = own.find(state)
+        result, own_contacts = own.find(state)
         assert own_contacts == contacts
-        assert found <= pairs
-        assert {pair for pair in pairs - found if not balls[list(pair)].all()} == set()
+        assert result <= pairs
+        assert {pair for pair in pairs - result if not balls[list(pair)].all()} == set()
         assert len(contacts) > 100
 
 
@@ -103,17 +103,17 @@ def test_crowded_balls_are_found(device):
         builder.add_shape_sphere(builder.add_body(xform=wp.transform(place, wp.quat_identity())), radius=0.005)
     model = builder.finalize(device=device)
     contacts = Search(model).find(model.state())[1]
-    found, own_contacts = Search(model, NeighborBroadPhase(model, FARTHEST)).find(model.state())
+    result, own_contacts = Search(model, NeighborBroadPhase(model, FARTHEST)).find(model.state())
     assert own_contacts == contacts
-    assert len(found) > 64 * 150 / 2
+    assert len(result) > 64 * 150 / 2
 
 
 def test_many_other_shapes_are_swept(device, monkeypatch):
     monkeypatch.setattr("warpmag.kernels.contacts.broad_phase._MOST_COMPARISONS", 100)
     model = random_scene(3, 2, device)
     pairs, contacts = Search(model).find(model.state())
-    found, own_contacts = Search(model, NeighborBroadPhase(model, FARTHEST)).find(model.state())
-    assert (found, own_contacts) == (pairs, contacts)
+    result, own_contacts = Search(model, NeighborBroadPhase(model, FARTHEST)).find(model.state())
+    assert (result, own_contacts) == (pairs, contacts)
 
 
 @pytest.mark.parametrize(("balls", "others", "swept"), [(50_000, 600, False), (2_000, 9_000, True)])

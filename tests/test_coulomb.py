@@ -37,7 +37,7 @@ def contact_ends(model, state, contacts, impulses):
     value = {name: getattr(contacts, f"rigid_contact_{name}").numpy()[:count].astype(float) for name in CONTACT}
     shape_body, body_q, com = model.shape_body.numpy(), state.body_q.numpy(), model.body_com.numpy()
     mass = masses(model)
-    found = []
+    results = []
     for c in range(count):
         shapes = int(value["shape0"][c]), int(value["shape1"][c])
         bodies = [shape_body[shape] for shape in shapes]
@@ -55,8 +55,8 @@ def contact_ends(model, state, contacts, impulses):
         normal = value["normal"][c]
         gap = normal @ (points[1] - points[0]) - value["margin0"][c] - value["margin1"][c]
         arms = [at - world(end, com[body]) if body >= 0 else at for end, body in enumerate(bodies)]
-        found.append(Ends(bodies, arms, [one > 0.0 for one in inverse], normal, gap, impulses[c]))
-    return found
+        results.append(Ends(bodies, arms, [entry > 0.0 for entry in inverse], normal, gap, impulses[c]))
+    return results
 
 
 def masses(model):
@@ -68,10 +68,10 @@ def velocities(model, state, ends, gravity):
     """Velocities that gravity and the impulses of contacts give the bodies, before they turn, shape [bodies, 6]."""
     mass, qd = masses(model), state.body_qd.numpy().astype(float)
     gains = np.zeros_like(qd)
-    for one in ends:
-        for body, arm, sign in zip(one.bodies, one.arms, (-1.0, 1.0), strict=True):
+    for end in ends:
+        for body, arm, sign in zip(end.bodies, end.arms, (-1.0, 1.0), strict=True):
             if body >= 0:
-                gains[body] += sign * np.concatenate([one.impulse, np.cross(arm, one.impulse)])
+                gains[body] += sign * np.concatenate([end.impulse, np.cross(arm, end.impulse)])
     for body in np.flatnonzero(np.isfinite(mass)):
         turn = np.array(wp.quat_to_matrix(wp.quat(*state.body_q.numpy()[body, 3:].tolist())), float).reshape(3, 3)
         qd[body, :3] += gains[body, :3] / mass[body] - (0.0, 0.0, gravity * DT)
@@ -117,15 +117,15 @@ def test_contacts_meet_coulombs_law(kind, mu, ground):
     qd = velocities(model, state, ends, G if ground else 0.0)
     size = np.abs(qd - state.body_qd.numpy())[:, :3].max()
     np.testing.assert_allclose(after[:, :3], qd[:, :3], rtol=0, atol=1e-4 * size)
-    most = max(one.impulse @ one.normal for one in ends)
+    most = max(end.impulse @ end.normal for end in ends)
     kinds = set()
-    for one in ends:
-        v = surface_velocities(one, qd)
+    for end in ends:
+        v = surface_velocities(end, qd)
         slip = v[1] - v[0]
-        slip -= (slip @ one.normal) * one.normal
-        opening = opening_speed(one, v)
-        push = one.impulse @ one.normal
-        rub = one.impulse - push * one.normal
+        slip -= (slip @ end.normal) * end.normal
+        opening = opening_speed(end, v)
+        push = end.impulse @ end.normal
+        rub = end.impulse - push * end.normal
         assert opening > -1e-4 * size and push >= -1e-6 * most and np.linalg.norm(rub) <= mu * push + 1e-6 * most
         if push < 1e-4 * most:  # as good as none
             continue
@@ -142,5 +142,5 @@ def test_thirty_iterations_leave_no_more_overlap_than_newtons_sixty(kind):
     model, state, contacts = heap(kind, "cpu")
     ends, ours = solve(PileXPBD(model, CAPACITY, iterations=30, **SETTINGS), model, state, contacts)
     theirs = substep(NewtonsXPBD, model, state, contacts, 60)[1]
-    left, newtons = (min(opening_speed(one, surface_velocities(one, qd)) for one in ends) for qd in (ours, theirs))
+    left, newtons = (min(opening_speed(end, surface_velocities(end, qd)) for end in ends) for qd in (ours, theirs))
     assert left >= min(0.0, newtons)

@@ -57,12 +57,12 @@ def program(page: Path) -> str:
 
 
 def pages_with_programs():
-    found = []
+    results = []
     for page in PAGES:
         if program(page):
             name = page.relative_to(DOCS if page.is_relative_to(DOCS) else ROOT).as_posix()
-            found.append(pytest.param(page, id=name, marks=[pytest.mark.long] if name in SLOW else []))
-    return found
+            results.append(pytest.param(page, id=name, marks=[pytest.mark.long] if name in SLOW else []))
+    return results
 
 
 @pytest.mark.parametrize("page", pages_with_programs())
@@ -121,6 +121,6 @@ def test_pages_build_without_a_warning(tmp_path):
     assert built.returncode == 0, built.stderr
     told = (tmp_path / "usd.html").read_text(encoding="utf-8")
     layer = Sdf.Layer.FindOrOpen(str(ROOT / "warpmag" / "usd" / "schema" / "generatedSchema.usda"))
-    attributes = {one.name for prim in layer.rootPrims for one in prim.properties}
+    attributes = {entry.name for prim in layer.rootPrims for entry in prim.properties}
     assert "warpmag:kind" in attributes
     assert {name for name in attributes if name not in told} == set()

@@ -56,12 +56,14 @@ class Decomposer:
         return vertices, faces
 
     def run_coacd(mesh, **settings):
-        legs = [np.array(one, float) for one in ([(0, 0), (3, 0), (3, 1), (0, 1)], [(0, 1), (1, 1), (1, 3), (0, 3)])]
-        found = []
+        legs = [
+            np.array(entry, float) for entry in ([(0, 0), (3, 0), (3, 1), (0, 1)], [(0, 1), (1, 1), (1, 3), (0, 3)])
+        ]
+        results = []
         for points, _, indices in map(prism, legs):
             quads = np.reshape(indices, (-1, 4))
-            found.append((np.array(points), np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])))
-        return found
+            results.append((np.array(points), np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])))
+        return results
 
 
 def magnetics_of(folder, approximation, outline=FLAT_L, magnetization=None, drop=0):

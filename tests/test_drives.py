@@ -47,13 +47,13 @@ def hinge(builder, angle, arm=0.0, axis=(0.0, 1.0, 0.0), **drive):
 
 def angles(simulation, bar, axis, steps):
     """How far a bar is turned about an axis after each step [rad]."""
-    found = []
+    results = []
     for step in range(steps + 1):
         if step:
             simulation.step()
         q = simulation.state.body_q.numpy()[bar, 3:].astype(float)
-        found.append(2.0 * math.atan2(q[:3] @ axis, q[3]))
-    return np.unwrap(found)
+        results.append(2.0 * math.atan2(q[:3] @ axis, q[3]))
+    return np.unwrap(results)
 
 
 def swing(rate, angle, center, steps, law=math.sin):
@@ -262,8 +262,8 @@ def test_targets_may_change_between_steps(device):
     simulation.control = other
     lowered = angles(simulation, bar, axis, 80)[-1]
     simulation.control = other  # the same again makes no new graph
-    found = np.array((before, raised, lowered))
-    np.testing.assert_allclose(found, (sag, sag * math.cos(0.5) - 0.5, sag * math.cos(0.5) + 0.5), atol=0.05 * sag)
+    result = np.array((before, raised, lowered))
+    np.testing.assert_allclose(result, (sag, sag * math.cos(0.5) - 0.5, sag * math.cos(0.5) + 0.5), atol=0.05 * sag)
     assert not simulation.capture_failure
 
 

@@ -25,8 +25,8 @@ def wrenches(model, **arguments):
     magnetics = warpmag.Magnetics(model, **arguments)
     state = model.state()
     magnetics.apply(state)
-    found = state.body_f.numpy().astype(float)
-    return found[:, :3], found[:, 3:], magnetics
+    result = state.body_f.numpy().astype(float)
+    return result[:, :3], result[:, 3:], magnetics
 
 
 def test_two_permanent_balls_in_line(device):
@@ -140,17 +140,17 @@ def test_a_box_has_its_exact_moment(box_and_ball):
     _, _, magnetics, model = box_and_ball
     turn = wp.transform_get_rotation(wp.transform(*model.body_q.numpy()[0].tolist()))
     expected = 8.0 * 0.01 * 0.006 * 0.004 * np.array(wp.quat_rotate(turn, wp.vec3(0.3 * M, 0.0, M)))
-    found = magnetics.shape_moments()[list(magnetics.shapes).index(0)]
-    np.testing.assert_allclose(found, expected, atol=SINGLE * np.linalg.norm(expected))
+    actual = magnetics.shape_moments()[list(magnetics.shapes).index(0)]
+    np.testing.assert_allclose(actual, expected, atol=SINGLE * np.linalg.norm(expected))
 
 
 def test_a_box_is_pulled_and_turned_as_the_sum_of_its_moments(box_and_ball):
     forces, torques, magnetics, model = box_and_ball
     system = magnetics.system
     positions, moments = system.positions.numpy().astype(float), system.moments.numpy().astype(float)
-    counts = [len(one.lattice.volumes) for one in magnetics.magnets]
-    radii = np.concatenate([one.lattice.radii for one in magnetics.magnets])
-    bodies = np.repeat([one.body for one in magnetics.magnets], counts)
+    counts = [len(magnet.lattice.volumes) for magnet in magnetics.magnets]
+    radii = np.concatenate([magnet.lattice.radii for magnet in magnetics.magnets])
+    bodies = np.repeat([magnet.body for magnet in magnetics.magnets], counts)
     arguments = {"radii": radii, "bodies": bodies}
     each = oracle.kelvin_force(moments, oracle.field_gradient(positions, moments, **arguments))
     turning = oracle.torque(moments, oracle.h_field(positions, moments, **arguments))
@@ -231,15 +231,15 @@ def test_worlds_do_not_see_each_other(device):
 
 
 def test_a_magnet_outside_all_worlds_needs_one_world(device):
-    one = new_builder()
-    add_ball(one, (0.0, 0.0, 0.02))
+    first = new_builder()
+    add_ball(first, (0.0, 0.0, 0.02))
     scene = new_builder()
     shape = scene.add_shape_sphere(-1, radius=R, label="stray")
     warpmag.add_permanent(scene, shape=shape, magnetization=(0.0, 0.0, M))
-    scene.add_world(one)
+    scene.add_world(first)
     forces, _, _ = wrenches(scene.finalize(device=device))
     assert forces[0, 2] < 0.0
-    scene.add_world(one)
+    scene.add_world(first)
     with pytest.raises(warpmag.InputError, match="stray: a magnet outside all worlds, while 2 worlds"):
         warpmag.Magnetics(scene.finalize(device=device))
 
@@ -320,9 +320,9 @@ def test_meshes_of_the_same_triangles_are_sampled_once(device):
         builder.add_shape_mesh(body, mesh=newton.Mesh(corners * [1.0, 1.0, height], faces))
         warpmag.add_inducible(builder, body=body, moment_spacing=0.003)
     magnetics = warpmag.Magnetics(builder.finalize(device=device))
-    one, other, longer = (magnet.lattice for magnet in magnetics.magnets)
-    assert one is other
-    assert longer.volumes.sum() == pytest.approx(1.5 * one.volumes.sum(), rel=1e-2)  # of what cells resolve
+    first, other, longer = (magnet.lattice for magnet in magnetics.magnets)
+    assert first is other
+    assert longer.volumes.sum() == pytest.approx(1.5 * first.volumes.sum(), rel=1e-2)  # of what cells resolve
 
 
 def nail(builder, lean, stretch=1.0, shift=0.0):

@@ -82,7 +82,7 @@ def test_balls_jump_to_the_magnet(reference):
 
 def test_a_run_repeats_bit_by_bit_with_and_without_graphs(device):
     simulations = [Simulation(pile(), device=device, graphs=graphs) for graphs in (True, True, False)]
-    first, *others = [(run(one, 30), one.state.body_qd.numpy()) for one in simulations]
+    first, *others = [(run(simulation, 30), simulation.state.body_qd.numpy()) for simulation in simulations]
     for other in others:
         np.testing.assert_array_equal(other[0], first[0])
         np.testing.assert_array_equal(other[1], first[1])
@@ -187,11 +187,11 @@ def test_a_state_may_be_changed_between_steps(device):
     first, second = (Simulation(pile(), device=device) for _ in range(2))
     run(first, 30)
     run(second, 1)
-    found = first.state
+    result = first.state
     for name in ("body_q", "body_qd", "joint_q", "joint_qd"):
-        getattr(second.state, name).assign(getattr(found, name))
-    for one in (first, second):
-        one.magnetics.system.start_cold()
+        getattr(second.state, name).assign(getattr(result, name))
+    for entry in (first, second):
+        entry.magnetics.system.start_cold()
     # up to rounding: neighbours are listed in another order; with contacts of the state before it is 1e-3 radii
     np.testing.assert_allclose(run(second, 3), run(first, 3), atol=1e-4 * R)
 
@@ -271,7 +271,7 @@ def test_a_state_that_is_mended_goes_on(device):
         run(broken, 2)
     for array, values in zip((broken.state.body_q, broken.state.body_qd), start, strict=True):
         array.assign(values)
-    ends = [run(one, 20) for one in (broken, whole)]
+    ends = [run(entry, 20) for entry in (broken, whole)]
     # induction starts from other moments, and ends within its error of the same ones
     np.testing.assert_allclose(*ends, atol=0.01 * R)
     assert broken.statistics.steps == 20

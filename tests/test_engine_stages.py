@@ -29,7 +29,7 @@ def stage_run(device, tmp_path_factory):
 
 def test_a_stage_is_imported_with_its_magnets(stage_run):
     simulation, _, _ = stage_run
-    kinds = [one.magnet.kind for one in simulation.magnetics.magnets]
+    kinds = [magnet.magnet.kind for magnet in simulation.magnetics.magnets]
     assert kinds == ["inducible"] * 4 + ["permanent"]
     assert simulation.statistics.magnets == 4
     assert simulation.step_size == pytest.approx(1e-3)

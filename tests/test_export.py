@@ -147,9 +147,9 @@ def test_shapes_keep_their_places_and_sizes(exported, run):
     for path, own in paths.items():
         boxes = [
             UsdGeom.BBoxCache(0.0, [UsdGeom.Tokens.default_])
-            .ComputeWorldBound(one.GetPrimAtPath(at))
+            .ComputeWorldBound(entry.GetPrimAtPath(at))
             .ComputeAlignedBox()
-            for one, at in ((source, path), (stage, own))
+            for entry, at in ((source, path), (stage, own))
         ]
         np.testing.assert_allclose(boxes[1].GetMin(), boxes[0].GetMin(), atol=1e-7)
         np.testing.assert_allclose(boxes[1].GetMax(), boxes[0].GetMax(), atol=1e-7)
@@ -229,14 +229,14 @@ def test_field_lines_begin_at_the_pole_of_the_magnet(exported):
 def test_numbers_are_those_of_the_run(run):
     body_q, body_qd, moments = frames()
     export(run, run.with_name("numbers.npz"))
-    with np.load(run.with_name("numbers.npz")) as found:
-        assert found["bodies"].tolist() == list(BODIES) and found["magnets"].tolist() == list(MAGNETS)
-        np.testing.assert_allclose(found["time"], (0.0, 0.017, 0.033, 0.05, 0.067), atol=1e-9)
-        np.testing.assert_allclose(found["positions"], body_q[..., :3], atol=1e-8)
-        assert (np.abs(np.einsum("fni,fni->fn", found["orientations"], body_q[..., 3:])) > 1.0 - 1e-6).all()
-        np.testing.assert_allclose(found["velocities"], body_qd[..., :3], atol=3e-6)
-        np.testing.assert_allclose(found["angular_velocities"], body_qd[..., 3:], atol=3e-6)
-        np.testing.assert_array_equal(found["moments"], moments)
+    with np.load(run.with_name("numbers.npz")) as result:
+        assert result["bodies"].tolist() == list(BODIES) and result["magnets"].tolist() == list(MAGNETS)
+        np.testing.assert_allclose(result["time"], (0.0, 0.017, 0.033, 0.05, 0.067), atol=1e-9)
+        np.testing.assert_allclose(result["positions"], body_q[..., :3], atol=1e-8)
+        assert (np.abs(np.einsum("fni,fni->fn", result["orientations"], body_q[..., 3:])) > 1.0 - 1e-6).all()
+        np.testing.assert_allclose(result["velocities"], body_qd[..., :3], atol=3e-6)
+        np.testing.assert_allclose(result["angular_velocities"], body_qd[..., 3:], atol=3e-6)
+        np.testing.assert_array_equal(result["moments"], moments)
     export(run, run.with_name("numbers.csv"))
     with open(run.with_name("numbers.csv"), encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))

@@ -41,8 +41,8 @@ def test_mutants_repeat(sources, tmp_path):
 @pytest.mark.parametrize("numbers", [FEW, pytest.param(MANY, marks=pytest.mark.long)], ids=["few", "many"])
 def test_spoiled_stages_are_refused_or_run(numbers, device, sources, tmp_path):
     verdicts = [judge(number, SEED, tmp_path, sources, in_process, device) for number in numbers]
-    assert [(one.number, one.done, one.problems) for one in verdicts if one.problems] == []
-    refused = sum(one.run == BAD_INPUT for one in verdicts)
+    assert [(verdict.number, verdict.done, verdict.problems) for verdict in verdicts if verdict.problems] == []
+    refused = sum(verdict.run == BAD_INPUT for verdict in verdicts)
     assert len(numbers) // 5 < refused < len(numbers)  # the mutator does neither too little nor too much
 
 
@@ -60,7 +60,7 @@ def test_what_a_named_material_weighs_is_known_to_both(case, metres, tmp_path):
     """Of USD alone as the campaign reads it, and of the model."""
     lines, of_oak, density = WEIGHS[case]
     schemas = "RigidBody Collision Mass".split()
-    iron = f"""def Sphere "Ball" (prepend apiSchemas = [{"".join(f'"Physics{one}API", ' for one in schemas)}
+    iron = f"""def Sphere "Ball" (prepend apiSchemas = [{"".join(f'"Physics{schema}API", ' for schema in schemas)}
         "MaterialBindingAPI", "WarpmagMagnetAPI"]) {{
         uniform token warpmag:material = "iron"
         {lines}

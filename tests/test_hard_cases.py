@@ -115,11 +115,11 @@ def solve(case, dtype, device, **arguments):
     arguments = {"saturation": MS, "rtol": RTOL, **case.arguments, **arguments}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        found = warpmag.solve_induction(
+        result = warpmag.solve_induction(
             case.positions, case.radii, external_field=np.asarray(case.applied), dtype=dtype, device=device, **arguments
         )
-        force, torque = found.wrench()
-    return found, force, torque, [str(one.message) for one in caught]
+        force, torque = result.wrench()
+    return result, force, torque, [str(entry.message) for entry in caught]
 
 
 def true_residual(case, found):
@@ -147,15 +147,15 @@ def test_hard_case(name, dtype, device):
         case = Case(
             np.asarray(case.positions, np.float32).astype(float), case.radii, case.applied, case.arguments
         )  # what the solve sees
-    found, force, torque, said = solve(case, dtype, device)
-    for values in (found.magnetizations, found.h_field, force, torque, found.error):
+    result, force, torque, said = solve(case, dtype, device)
+    for values in (result.magnetizations, result.h_field, force, torque, result.error):
         assert np.isfinite(values).all()
-    if found.converged:
-        assert found.error <= RTOL and not said
+    if result.converged:
+        assert result.error <= RTOL and not said
         # float32: fields of neighbours and their sum are known to a few 1e-6 of the largest, f' is at most 3
-        assert true_residual(case, found) <= RTOL + (2e-5 if dtype == "float32" else 1e-9)
+        assert true_residual(case, result) <= RTOL + (2e-5 if dtype == "float32" else 1e-9)
     else:
-        assert found.error > RTOL
+        assert result.error > RTOL
         assert len(said) == 1 and "did not converge" in said[0]
 
 
@@ -165,8 +165,8 @@ def test_sizes_beyond_single_precision_are_refused(scale, device):
     case = Case(scale * fcc_block((2, 2, 2)), scale * R)
     with pytest.raises(InputError, match="radii: must be 5e-08 to 20000 m in float32, got .*; use float64"):
         solve(case, "float32", device)
-    found, force, _, _ = solve(case, "float64", device)
-    assert found.converged and np.isfinite(force).all() and true_residual(case, found) <= RTOL + 1e-9
+    result, force, _, _ = solve(case, "float64", device)
+    assert result.converged and np.isfinite(force).all() and true_residual(case, result) <= RTOL + 1e-9
 
 
 @pytest.mark.long
@@ -174,6 +174,6 @@ def test_sizes_beyond_single_precision_are_refused(scale, device):
 def test_a_clump_of_100_000_balls(device):
     """As many balls as fit ten times over: every list of neighbours is full."""
     case = Case(_random(100_000, 0.25, seed=5))
-    found, force, _, said = solve(case, "float32", device)
-    assert np.isfinite(force).all() and np.isfinite(found.magnetizations).all()
-    assert found.converged or "did not converge" in said[0]
+    result, force, _, said = solve(case, "float32", device)
+    assert np.isfinite(force).all() and np.isfinite(result.magnetizations).all()
+    assert result.converged or "did not converge" in said[0]

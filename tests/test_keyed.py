@@ -186,7 +186,7 @@ def test_a_spline_is_refused_where_a_run_would_follow_it(tmp_path):
     stage = Usd.Stage.Open(str(path))
     stage.GetAttributeAtPath("/World/Part.xformOp:translateX").SetSpline(spline)
     stage.Save()
-    assert [str(one) for one in check(path).errors] == [
+    assert [str(error) for error in check(path).errors] == [
         "/World/Part: xformOp:translateX is a spline, which a run does not read: bake it into time samples"
     ]
 

@@ -48,8 +48,8 @@ def test_a_pulsed_field_turns_a_compass_and_magnetizes_iron(tmp_path, device):
     for number in range(250):
         simulation.step()
         field = np.interp(simulation.time - 5e-4, [0.05, 0.1, 0.2], [0.0, height, 0.0])  # of the last substep
-        found = simulation.magnetics.system.external_field.numpy()
-        assert found[:, 1] == pytest.approx(field, abs=1e-5 * height)
+        result = simulation.magnetics.system.external_field.numpy()
+        assert result[:, 1] == pytest.approx(field, abs=1e-5 * height)
         if number % 50 == 0:
             moments = dict(zip(simulation.magnetics.shapes, simulation.magnetics.shape_moments(), strict=True))
             shape = simulation._scene.magnet_shapes["/World/Iron"][0]
@@ -103,8 +103,8 @@ def test_a_magnet_that_is_switched(tmp_path, device, where):
             simulation.step()
         own = [np.interp(simulation.time - 5e-4, times, column) for column in values.T]
         turned = np.array([-own[1], own[0], own[2]])  # the prim is turned by 90 degrees about z
-        found = simulation.magnetics.shape_moments()[row] / simulation.magnetics.shape_volumes[row]
-        np.testing.assert_allclose(found, turned, rtol=0, atol=1e-5 * np.abs(values).max())
+        result = simulation.magnetics.shape_moments()[row] / simulation.magnetics.shape_volumes[row]
+        np.testing.assert_allclose(result, turned, rtol=0, atol=1e-5 * np.abs(values).max())
 
 
 def test_substeps_that_are_shortened_follow_the_same_keys(tmp_path, device):
@@ -142,19 +142,19 @@ def test_substeps_that_are_shortened_follow_the_same_keys(tmp_path, device):
 def test_what_no_body_can_follow_is_refused(tmp_path, lines, message):
     lines = lines.replace("'", "").replace("None", "None")
     path = write(tmp_path, prim("Cube", "Part", (BODY, COLLIDER), "double size = 0.01", KINEMATIC, lines), held_ball(1))
-    refusals = [str(one) for one in check(path).errors]
+    refusals = [str(error) for error in check(path).errors]
     assert refusals and refusals[0].startswith(message), refusals
 
 
 def test_samples_of_fields_that_are_not_finite_are_refused(tmp_path):
     bad = text({0: "(0, 0, 0)", 5: "(0, nan, 0)"})
     path = write(tmp_path, held_ball(0), scene=f"vector3f warpmag:externalField.timeSamples = {bad}")
-    assert [str(one) for one in check(path).errors] == [
+    assert [str(error) for error in check(path).errors] == [
         "/World/Scene: warpmag:externalField at time code 5: must be finite, got (0.0, nan, 0.0)"
     ]
     lines = 'uniform token warpmag:kind = "permanent"', f"vector3f warpmag:magnetization.timeSamples = {bad}"
     path = write(tmp_path, prim("Sphere", "Part", (COLLIDER, MAGNET), "double radius = 0.01", *lines), held_ball(1))
-    assert [str(one) for one in check(path).errors] == [
+    assert [str(error) for error in check(path).errors] == [
         "/World/Part: warpmag:magnetization at time code 5: must be finite, got (0.0, nan, 0.0)"
     ]
 
@@ -167,10 +167,12 @@ def test_the_stage_of_a_run_has_the_scenes_keys(tmp_path, device, capsys):
     assert main(["check", str(path)]) == 0
     assert "keyed       1 bodies, 0 magnetizations\n" in capsys.readouterr().out
     Simulation(path, device=device).run(3, output=tmp_path / "out.usda")
-    scene, result = (Usd.Stage.Open(str(one)) for one in (path, tmp_path / "out.usda"))
+    scene, result = (Usd.Stage.Open(str(entry)) for entry in (path, tmp_path / "out.usda"))
     for time in (0.0, 1.1, 3.3, 24.0):
-        for expected, found in zip(*(pose_of(one, "/World/Arm/Magnet", time) for one in (scene, result)), strict=True):
-            assert (expected == found).all()
+        for expected, actual in zip(
+            *(pose_of(entry, "/World/Arm/Magnet", time) for entry in (scene, result)), strict=True
+        ):
+            assert (expected == actual).all()
     ball = result.GetPrimAtPath("/World/Ball").GetAttribute("xformOp:translate:warpmag")
     assert ball.GetNumTimeSamples() == 4
     moments = result.GetPrimAtPath("/World/Arm/Magnet").GetAttribute("warpmag:moment")
@@ -194,5 +196,5 @@ def test_a_resumed_run_goes_on_along_the_keys(tmp_path, device, monkeypatch):
 
     expected = run("whole", 4, False)
     for last in (1, 3, 4):
-        found = run("parts", last, True)
-    assert found == expected
+        actual = run("parts", last, True)
+    assert actual == expected

@@ -45,8 +45,8 @@ def applied(magnetics, model) -> tuple[np.ndarray, np.ndarray]:
     """Forces [N] and torques [N·m] on bodies at their first poses."""
     state = model.state()
     magnetics.apply(state)
-    found = state.body_f.numpy().astype(float)
-    return found[:, :3], found[:, 3:]
+    result = state.body_f.numpy().astype(float)
+    return result[:, :3], result[:, 3:]
 
 
 @pytest.fixture(autouse=True)
@@ -139,9 +139,11 @@ def rods():
 def test_bodies_of_several_moments_do_not_turn_themselves(rods, device):
     model = rods.finalize(device=device)
     magnetics = warpmag.Magnetics(model, method="fmm")
-    found, expected = (applied(one, model) for one in (magnetics, warpmag.Magnetics(model, method="direct", rtol=1e-5)))
+    actual, expected = (
+        applied(entry, model) for entry in (magnetics, warpmag.Magnetics(model, method="direct", rtol=1e-5))
+    )
     assert far_cells(magnetics)
-    for own, exact in zip(found, expected, strict=True):
+    for own, exact in zip(actual, expected, strict=True):
         assert apart(own, exact) <= 3.0 * RTOL
 
 
@@ -167,7 +169,7 @@ def test_a_graph_does_what_launches_do(device):
     builder = new_builder()
     warpmag.add_balls(builder, places_of(600), RADIUS)
     model = builder.finalize(device=device)
-    found = []
+    results = []
     for captured in (False, True):
         magnetics, state = warpmag.Magnetics(model, method="fmm", external_field=FIELD), model.state()
         magnetics.apply(state)
@@ -180,9 +182,9 @@ def test_a_graph_does_what_launches_do(device):
             wp.capture_launch(capture.graph)
         else:
             magnetics.apply(state)
-        found.append(state.body_f.numpy())
-    assert np.isfinite(found[0]).all()
-    assert (found[0] == found[1]).all()
+        results.append(state.body_f.numpy())
+    assert np.isfinite(results[0]).all()
+    assert (results[0] == results[1]).all()
 
 
 def test_a_run_of_a_scene_of_another_number_of_balls(device, tmp_path, capsys):

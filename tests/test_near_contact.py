@@ -168,8 +168,8 @@ def test_slope_of_langevins_curve():
 def test_saturated_balls_are_dipoles(strength, dipole):
     x = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.05], [1.9, 0.0, 1.0]])
     h0 = strength * np.array([0.3, 0.0, 1.0])
-    found, forces = contact_oracle.equilibrium(x, 1.0, h0, saturation=1.0)
-    assert found.residual < 1e-12
+    result, forces = contact_oracle.equilibrium(x, 1.0, h0, saturation=1.0)
+    assert result.residual < 1e-12
     alone = oracle.equilibrium(x, 1.0, h0, saturation=1.0)
     moments = 4.0 / 3.0 * np.pi * alone.magnetizations
     dipoles = oracle.kelvin_force(moments, oracle.field_gradient(x, moments, radii=1.0))
@@ -214,11 +214,11 @@ def test_device_solution_is_the_reference(strength, dtype, error, device):
     field = strength * IRON * np.array([0.4, -0.3, 0.9])
     settings = {"susceptibility": MIXED_SUSCEPTIBILITIES}
     exact, exact_forces = contact_oracle.equilibrium(MIXED, MIXED_RADII, field, saturation=IRON, **settings)
-    found = solve(MIXED, MIXED_RADII, field, device, dtype, **settings)
-    assert found.converged
-    assert relative(found.magnetizations, exact.magnetizations) < error
-    assert relative(found.h_field, exact.h) < error
-    forces, torques = found.wrench()
+    actual = solve(MIXED, MIXED_RADII, field, device, dtype, **settings)
+    assert actual.converged
+    assert relative(actual.magnetizations, exact.magnetizations) < error
+    assert relative(actual.h_field, exact.h) < error
+    forces, torques = actual.wrench()
     assert relative(forces, exact_forces) < error  # float32: forces add up from parts ten times as large
     assert np.abs(forces.sum(0)).max() < (1e-12 if dtype == "float64" else 1e-5) * np.abs(forces).max()
     assert np.abs(torques).max() < error * 0.005 * np.abs(forces).max()
@@ -231,28 +231,28 @@ def test_device_follows_the_curve(curve, strength, device):
     field = strength * IRON * np.array([0.4, -0.3, 0.9])
     settings = {"susceptibility": MIXED_SUSCEPTIBILITIES, "curve": curve}
     exact, exact_forces = contact_oracle.equilibrium(MIXED, MIXED_RADII, field, saturation=IRON, **settings)
-    found = solve(MIXED, MIXED_RADII, field, device, **settings)
+    actual = solve(MIXED, MIXED_RADII, field, device, **settings)
     # the slope of Langevin's curve is good to 2e-4 there
-    assert relative(found.magnetizations, exact.magnetizations) < 1e-4
-    assert relative(found.wrench()[0], exact_forces) < 1e-4
+    assert relative(actual.magnetizations, exact.magnetizations) < 1e-4
+    assert relative(actual.wrench()[0], exact_forces) < 1e-4
 
 
 def test_device_pair_is_exact(device):
     """Balls of infinite permeability at 1 % of the radius in a weak field, against the exact force."""
     two = pair(2.01 * 0.005, (0.005, 0.005), (np.inf, np.inf))
     m = np.linalg.solve(two.resistance[0], np.full(2, 100.0))
-    found = solve(np.array([0 * ALONG, 2.01 * 0.005 * ALONG]), 0.005, 100.0 * ALONG, device)
+    result = solve(np.array([0 * ALONG, 2.01 * 0.005 * ALONG]), 0.005, 100.0 * ALONG, device)
     # a field of 6e-5 Ms already softens the contact by (M/Ms)²
-    assert found.wrench()[0][1, 2] == pytest.approx(-0.5 * MU0 * m @ two.slope[0] @ m, rel=2e-3)
+    assert result.wrench()[0][1, 2] == pytest.approx(-0.5 * MU0 * m @ two.slope[0] @ m, rel=2e-3)
 
 
 @pytest.mark.parametrize("extent", [0.5, 0.2, 0.08])
 def test_device_heaps(extent, device):
     """300 balls with no regard for one another: the solve ends converged, and forces add up to nothing."""
     x = np.random.default_rng(1).uniform(-0.5, 0.5, (300, 3)) * extent
-    found = solve(x, 0.01, 0.1 * IRON * ALONG, device, rtol=1e-9)
-    assert found.converged
-    forces, _ = found.wrench()
+    result = solve(x, 0.01, 0.1 * IRON * ALONG, device, rtol=1e-9)
+    assert result.converged
+    forces, _ = result.wrench()
     assert np.isfinite(forces).all()
     assert np.abs(forces.sum(0)).max() < 1e-9 * np.abs(forces).max()
 
@@ -260,10 +260,10 @@ def test_device_heaps(extent, device):
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_device_scale(scale, device):
     """Lengths times s: the same magnetizations, forces times s², also in float32."""
-    one = solve(MIXED, MIXED_RADII, 1e5 * ALONG, device, "float32", rtol=1e-5)
+    first = solve(MIXED, MIXED_RADII, 1e5 * ALONG, device, "float32", rtol=1e-5)
     other = solve(scale * MIXED, scale * MIXED_RADII, 1e5 * ALONG, device, "float32", rtol=1e-5)
-    assert relative(other.magnetizations, one.magnetizations) < 1e-4  # roundings, and rtol
-    assert relative(other.wrench()[0] / scale**2, one.wrench()[0]) < 1e-3
+    assert relative(other.magnetizations, first.magnetizations) < 1e-4  # roundings, and rtol
+    assert relative(other.wrench()[0] / scale**2, first.wrench()[0]) < 1e-3
 
 
 def test_device_zero_field_and_no_near_pair(device):
@@ -307,7 +307,7 @@ def test_device_precisions_agree_before_a_solve_has_ended(device):
     x = np.concatenate([MIXED, [[0.02, 0.01, 0.0]]])
     magnet = np.zeros((6, 3))
     magnet[5] = [0.3, 0.0, 0.4]
-    found = {}
+    results = {}
     for dtype in ("float64", "float32"):
         system = moment_system(
             radii=np.append(MIXED_RADII, 0.005), permanent=np.arange(6) == 5, movable=np.arange(6) != 1,
@@ -323,10 +323,10 @@ def test_device_precisions_agree_before_a_solve_has_ended(device):
             system.apply_forces()
             steps.append([getattr(system, name).numpy() for name in ("h", "forces", "torques")])
             system.positions.assign(1.01 * x)
-        found[dtype] = steps
-    for single, double in zip(found["float32"], found["float64"], strict=True):
-        for one, other in zip(single, double, strict=True):
-            assert relative(one, other) < 1e-4  # roundings, and what they make of a torque near equilibrium
+        results[dtype] = steps
+    for single, double in zip(results["float32"], results["float64"], strict=True):
+        for entry, other in zip(single, double, strict=True):
+            assert relative(entry, other) < 1e-4  # roundings, and what they make of a torque near equilibrium
         assert np.abs(single[1][1]).max() == 0.0 and np.abs(single[2]).max() > 0.0
 
 
@@ -371,9 +371,9 @@ def test_device_piles_of_any_size(side, device):
 
 
 def test_only_the_kelvin_law(device):
-    found = solve(MIXED, MIXED_RADII, 1e5 * ALONG, device)
+    result = solve(MIXED, MIXED_RADII, 1e5 * ALONG, device)
     with pytest.raises(warpmag.InputError, match="multipole"):
-        found.wrench("zeeman")
+        result.wrench("zeeman")
     with pytest.raises(warpmag.InputError, match="multipole"):
         moment_system(radii=np.ones(2), force="zeeman", contact_model="multipole", device=device)
 

@@ -108,10 +108,10 @@ def test_force_in_a_nonuniform_field(name, size, place, device):
     """A radius or more away from wires within 0.5 % of the exact series; dipoles lack up to 26 %."""
     source, field = SOURCES[name], field_of(SOURCES[name], device)
     for susceptibility in (math.inf, 1.0):
-        found = ball_in(source, device, size=size, susceptibility=susceptibility)(place)[:3]
+        actual = ball_in(source, device, size=size, susceptibility=susceptibility)(place)[:3]
         exact = ball_in_field.force_in_field(field, np.array(place), size, susceptibility, order=12)
         # degrees above 4, and for maps the third power of the spacing
-        assert np.linalg.norm(found - exact) < 5e-3 * np.linalg.norm(exact)
+        assert np.linalg.norm(actual - exact) < 5e-3 * np.linalg.norm(exact)
     dipole = ball_in(source, device, size=size, model="dipole", susceptibility=1.0)(place)[:3]
     assert np.linalg.norm(dipole - exact) > 0.01 * np.linalg.norm(exact)
 
@@ -121,10 +121,10 @@ def test_the_coil_feels_the_opposite(dtype, tolerance, device):
     """Momentum and angular momentum about the coil, which is turned."""
     frame = (0.003, -0.002, 0.001, *TURN)
     place = np.array([0.008, 0.004, 0.009])
-    found = ball_in(SOURCES["loop"], device, dtype=dtype, frame=frame)(place)
-    np.testing.assert_allclose(found[3:6], -found[:3], atol=tolerance * np.abs(found[:3]).max())
+    result = ball_in(SOURCES["loop"], device, dtype=dtype, frame=frame)(place)
+    np.testing.assert_allclose(result[3:6], -result[:3], atol=tolerance * np.abs(result[:3]).max())
     arm = place - frame[:3]
-    np.testing.assert_allclose(found[6:], -np.cross(arm, found[:3]), atol=tolerance * np.abs(found[:3]).max() * 0.02)
+    np.testing.assert_allclose(result[6:], -np.cross(arm, result[:3]), atol=tolerance * np.abs(result[:3]).max() * 0.02)
 
 
 @pytest.mark.parametrize("which", ["loop", "box"])
@@ -151,10 +151,10 @@ def test_what_is_added_has_an_energy(which, distance, device):
 
 def test_far_away_nothing_is_added(device):
     z = 1.00001 * contact_table.MAGNET_REACH[1] * 0.002
-    found, dipole = (
+    result, dipole = (
         ball_in(SOURCES["loop"], device, size=0.002, model=model)((0.0, 0.003, z)) for model in ("multipole", "dipole")
     )
-    np.testing.assert_array_equal(found, dipole)
+    np.testing.assert_array_equal(result, dipole)
 
 
 @pytest.mark.parametrize("touched", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.3, 1.0, -0.2)])
@@ -165,5 +165,5 @@ def test_faces_of_a_box(half, touched, device):
     exact = ball_in_field.force_in_field(
         lambda x: ball_in_field.box_field(x, np.full(3, half), 1e4), place, R, order=16
     )
-    found = box((half,) * 3, device, contact_model="multipole")(place)[:3]
-    np.testing.assert_allclose(found, exact, atol=1e-3 * np.linalg.norm(exact))
+    actual = box((half,) * 3, device, contact_model="multipole")(place)[:3]
+    np.testing.assert_allclose(actual, exact, atol=1e-3 * np.linalg.norm(exact))

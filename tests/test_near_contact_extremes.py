@@ -53,17 +53,17 @@ def test_balls_in_one_another(arrange, ratio, dtype, scale, device):
     error = {"float64": 1e-8, "float32": 1e-3}[dtype]
     for depth in (0.0, 1e-15, 1e-9, 1e-6, 1e-3, 0.3, 0.51, 0.95):
         x, radii = (np.asarray(scale * a, dtype).astype(float) for a in arrange(ratio, depth))
-        found = solve(x, radii, 0.1 * IRON * DIRECTION, dtype, device)
+        actual = solve(x, radii, 0.1 * IRON * DIRECTION, dtype, device)
         exact, forces = contact_oracle.equilibrium(
             x / radii[0], radii / radii[0], 0.1 * IRON * DIRECTION, saturation=IRON
         )
-        assert found.converged
-        miss = np.linalg.norm(found.magnetizations - exact.magnetizations, axis=1)
+        assert actual.converged
+        miss = np.linalg.norm(actual.magnetizations - exact.magnetizations, axis=1)
         assert (miss < error * np.linalg.norm(exact.magnetizations, axis=1)).all()
         # forces of a small ball in a large one are small beside those of two dipoles at contact, which cancel in them
         moments = np.linalg.norm(exact.magnetizations, axis=1) * 4.0 / 3.0 * np.pi * (radii / radii[0]) ** 3
         unit = oracle.MU0 * moments * moments[0] / (1.0 + radii / radii[0]) ** 4
-        miss = np.linalg.norm(found.wrench()[0] / radii[0] ** 2 - forces, axis=1)
+        miss = np.linalg.norm(actual.wrench()[0] / radii[0] ** 2 - forces, axis=1)
         assert (miss < error * (np.linalg.norm(forces, axis=1) + unit)).all()
 
 
@@ -101,18 +101,18 @@ def test_any_scale(dtype, scale, strength, device):
     """Balls of 60 nm, of 1 km and of any size: the same magnetizations, forces as the square of the radius."""
     error = {"float64": 1e-6, "float32": 1e-3}[dtype]
     x, radii = (np.asarray(scale * a, dtype).astype(float) for a in (PILE, PILE_RADII))
-    found = solve(x, radii, strength * IRON * DIRECTION, dtype, device)
+    actual = solve(x, radii, strength * IRON * DIRECTION, dtype, device)
     exact, forces = contact_oracle.equilibrium(x / scale, radii / scale, strength * IRON * DIRECTION, saturation=IRON)
-    assert relative(found.magnetizations, exact.magnetizations) < error
-    assert relative(found.wrench()[0] / scale**2, forces) < error
+    assert relative(actual.magnetizations, exact.magnetizations) < error
+    assert relative(actual.wrench()[0] / scale**2, forces) < error
 
 
 def test_moments_without_a_force_in_float32(device):
     """Products of the moments of 60 nm balls in a field of 20 A/m are no float32: refused, where it was off by half."""
     x, radii = as_float32(6e-8 * PILE, 6e-8 * PILE_RADII)
-    found = solve(x, radii, 20.0 * DIRECTION, "float32", device)
+    actual = solve(x, radii, 20.0 * DIRECTION, "float32", device)
     with pytest.raises(warpmag.InputError, match=r"^radii, saturation, external_field: .* use float64$"):
-        found.wrench()
+        actual.wrench()
     forces, _ = solve(x, radii, 20.0 * DIRECTION, "float64", device).wrench()
     _, exact = contact_oracle.equilibrium(x / 6e-8, radii / 6e-8, 20.0 * DIRECTION, saturation=IRON)
     assert relative(forces / 6e-8**2, exact) < 1e-6

@@ -75,14 +75,14 @@ def test_forces_are_the_gradient_of_the_energy(cells, device):
     """
     bodies = np.array([0, 1, 2, 2, 2]) if cells else np.arange(5)
     radii = RADII * np.where(cells & (np.arange(5) > 1), 0.55, 1.0)  # larger cells would not act
-    found = [
+    result = [
         wrench(
             system(radii, device, balls=2, contact_model=model, bodies=bodies, susceptibility=SUSCEPTIBILITY),
             PLACES, MOMENTS,
         )
         for model in ("multipole", "dipole")
     ]  # fmt: skip
-    added, torques = (one - other for one, other in zip(*found, strict=True))
+    added, torques = (entry - other for entry, other in zip(*result, strict=True))
 
     def energy(x, m):
         return sum(
@@ -101,9 +101,9 @@ def test_forces_are_the_gradient_of_the_energy(cells, device):
             # central differences: step² of truncation, eps/step of rounding, and rtol of the dipoles' solutions
             assert abs(slope + added[i, axis]) < 1e-6 * np.abs(added).max()
             turn = np.cross(np.eye(3)[axis], MOMENTS)
-            one, other = (energy(PLACES, MOMENTS + s * 1e-5 * turn * (np.arange(5) == i)[:, None]) for s in (1, -1))
-            assert abs((one - other) / 2e-5 + torques[i, axis]) < 1e-6 * np.abs(torques).max()
-    assert np.abs(added[:2]).max() > 0.1 * np.abs(found[1][0][:2]).max()
+            entry, other = (energy(PLACES, MOMENTS + s * 1e-5 * turn * (np.arange(5) == i)[:, None]) for s in (1, -1))
+            assert abs((entry - other) / 2e-5 + torques[i, axis]) < 1e-6 * np.abs(torques).max()
+    assert np.abs(added[:2]).max() > 0.1 * np.abs(result[1][0][:2]).max()
 
 
 @pytest.mark.parametrize(
@@ -124,14 +124,14 @@ def test_a_ball_at_a_cube_of_cells(touched, device):
     moments = np.zeros((n + 1, 3))
     moments[1:, 2] = 1e6 * (2.0 * half) ** 3 / n
     radii = np.append(R, np.full(n, half / count))
-    found = [
+    actual = [
         wrench(
             system(radii, device, dtype="float32", bodies=np.append(0, np.ones(n, int)), contact_model=model),
             np.concatenate([[place], cells]), moments,
         )
         for model in ("multipole", "dipole")
     ]  # fmt: skip
-    added = (found[0][0] - found[1][0])[0]
+    added = (actual[0][0] - actual[1][0])[0]
 
     def exact(order):
         return ball_in_field.force_in_field(
@@ -179,8 +179,8 @@ def test_momentum_and_angular_momentum_are_kept(dtype, error, device):
 def test_only_what_may_move_is_pushed(device):
     free = wrench(system(RADII, device, balls=2), PLACES, MOMENTS)
     held = wrench(system(RADII, device, balls=2, movable=np.array([True, False, False, True, False])), PLACES, MOMENTS)
-    for one, other in zip(free, held, strict=True):
-        np.testing.assert_allclose(other[[0, 3]], one[[0, 3]], rtol=1e-12, atol=1e-14 * np.abs(one).max())
+    for entry, other in zip(free, held, strict=True):
+        np.testing.assert_allclose(other[[0, 3]], entry[[0, 3]], rtol=1e-12, atol=1e-14 * np.abs(entry).max())
         assert not other[[1, 2, 4]].any()
 
 
@@ -189,22 +189,22 @@ def test_magnets_of_a_recoil_permeability(device):
     order = [2, 0, 3, 1, 4]
     x, radii = PLACES[order], RADII[order]
     linear = np.array([magnet in (2, 3) for magnet in order])
-    found, moments = [], np.zeros((5, 3))
+    actual, moments = [], np.zeros((5, 3))
     for model in ("multipole", "dipole"):
         magnets = system(
             radii, device, balls=4, contact_model=model,
-            curve=["linear" if one else "tanh" for one in linear], susceptibility=np.where(linear, 0.05, np.inf),
+            curve=["linear" if entry else "tanh" for entry in linear], susceptibility=np.where(linear, 0.05, np.inf),
         )  # fmt: skip
         remanence = MOMENTS[order] / (4.0 / 3.0 * np.pi * radii[:, None] ** 3)
         magnets.bias.assign(np.where(linear[:, None], remanence / 0.05, 0.0))
-        found.append(wrench(magnets, x, np.where(linear[:, None], 0.0, MOMENTS[order])))
+        actual.append(wrench(magnets, x, np.where(linear[:, None], 0.0, MOMENTS[order])))
         moments = magnets.moments.numpy()
     fixed = [
         wrench(system(RADII, device, balls=2, contact_model=model), PLACES, moments[np.argsort(order)])
         for model in ("multipole", "dipole")
     ]
     for part in (0, 1):
-        added, expected = found[0][part] - found[1][part], fixed[0][part] - fixed[1][part]
+        added, expected = actual[0][part] - actual[1][part], fixed[0][part] - fixed[1][part]
         np.testing.assert_allclose(added[np.argsort(order)], expected, atol=1e-6 * np.abs(expected).max())
 
 
@@ -220,8 +220,8 @@ def test_worlds_are_apart(device):
         places.reshape(-1, 3), moments,
     )  # fmt: skip
     for k in range(3):
-        for one, all_of_them in zip(alone[k], together, strict=True):
-            assert relative(all_of_them[5 * k : 5 * k + 5], one) < 1e-9  # rtol of the solutions
+        for entry, all_of_them in zip(alone[k], together, strict=True):
+            assert relative(all_of_them[5 * k : 5 * k + 5], entry) < 1e-9  # rtol of the solutions
 
 
 @pytest.mark.parametrize("curve", ["tanh", "langevin", "clamped"])
@@ -266,16 +266,16 @@ def test_force_is_continuous(device):
 
 def test_threads_give_the_same_bits(device, monkeypatch):
     """However many threads of a CPU share the balls."""
-    found = []
+    results = []
     for count in (1, 2, 5):
         monkeypatch.setattr(near_pairs, "threads_for", lambda *_, count=count: count)
         magnets = system(
             np.tile(RADII, 80), device, dtype="float32", worlds=np.repeat(np.arange(80), 5),
             permanent=np.arange(400) % 5 >= 2,
         )  # fmt: skip
-        found.append(wrench(magnets, np.tile(PLACES, (80, 1)), np.tile(MOMENTS, (80, 1))))
-    for one in found[1:]:
-        np.testing.assert_array_equal(one, found[0])
+        results.append(wrench(magnets, np.tile(PLACES, (80, 1)), np.tile(MOMENTS, (80, 1))))
+    for entry in results[1:]:
+        np.testing.assert_array_equal(entry, results[0])
 
 
 def test_graph_gives_the_same_bits(device):

@@ -98,8 +98,8 @@ def test_field_gradient_and_flux_density_inside_and_out(dtype, tolerance, device
     assert inside.sum() >= 18
     b = oracle.MU0 * (h + inside @ (moments / VOLUME))
     gradient = oracle.field_gradient(x, moments, points, radii=R)
-    for found, expected in ((probe.h, h), (probe.b, b), (probe.gradient, gradient)):
-        np.testing.assert_allclose(found.numpy(), expected, atol=tolerance * np.abs(expected).max())
+    for actual, expected in ((probe.h, h), (probe.b, b), (probe.gradient, gradient)):
+        np.testing.assert_allclose(actual.numpy(), expected, atol=tolerance * np.abs(expected).max())
 
 
 def test_flux_density_inside_a_magnetized_sphere(device):
@@ -130,8 +130,8 @@ def test_each_point_sees_the_magnets_of_its_world(device):
         magnetics.h_field(points, worlds=0)
     magnetics.induce(model.state())
     field = magnetics.h_field(points, worlds=[2, 1, 0, 1])[:, 2]
-    one = 2.0 * M * VOLUME / (4.0 * math.pi * 0.02**3)
-    np.testing.assert_allclose(field, [one, -2.0 * one, one, -2.0 * one], rtol=SINGLE)
+    first = 2.0 * M * VOLUME / (4.0 * math.pi * 0.02**3)
+    np.testing.assert_allclose(field, [first, -2.0 * first, first, -2.0 * first], rtol=SINGLE)
     with pytest.raises(warpmag.InputError, match="worlds: must be given"):
         magnetics.h_field(points)
     with pytest.raises(warpmag.InputError, match="worlds: world 7 holds no magnets"):
@@ -160,7 +160,7 @@ def test_a_probe_in_a_crowd_of_balls(device):
 
 
 def test_probing_leaves_the_solve_as_it_is(device):
-    found = []
+    results = []
     for probed in (False, True):
         system, x = make_system("tanh", device, dtype="float32", rtol=1e-4)
         probe = FieldProbe(system, 5)
@@ -170,8 +170,8 @@ def test_probing_leaves_the_solve_as_it_is(device):
             system.solve()
             if probed:
                 probe.measure()
-        found.append(system.moments.numpy())
-    np.testing.assert_array_equal(*found)
+        results.append(system.moments.numpy())
+    np.testing.assert_array_equal(*results)
 
 
 def test_64_worlds_with_64_fields(device):
@@ -208,12 +208,12 @@ def test_magnetization_is_set_in_the_frame_of_the_body(device):
         magnetics.induce(state)
         x, y, z = magnetization
         expected = np.array([x, -z, y]) * 8.0 * R**3  # turned by the body's quarter about x
-        found = magnetics.shape_moments()[list(magnetics.shapes).index(0)]
-        np.testing.assert_allclose(found, expected, atol=SINGLE * M * 8.0 * R**3)
+        actual = magnetics.shape_moments()[list(magnetics.shapes).index(0)]
+        np.testing.assert_allclose(actual, expected, atol=SINGLE * M * 8.0 * R**3)
     model.warpmag.magnetization.assign(np.array([[0.0, 0.0, M], [0.0, 0.0, 0.0]]))  # in the frame of the shape
     magnetics.induce(state)
-    found = magnetics.shape_moments()[list(magnetics.shapes).index(0)]
-    np.testing.assert_allclose(found, [0.0, 0.0, -M * 8.0 * R**3], atol=SINGLE * M * 8.0 * R**3)
+    actual = magnetics.shape_moments()[list(magnetics.shapes).index(0)]
+    np.testing.assert_allclose(actual, [0.0, 0.0, -M * 8.0 * R**3], atol=SINGLE * M * 8.0 * R**3)
     for where in ({"body": ball}, {"shape": 1}, {}, {"body": 17}):
         with pytest.raises(warpmag.InputError, match="has no permanent magnet"):
             magnetics.set_magnetization((0.0, 0.0, M), **where)

@@ -114,9 +114,9 @@ def test_two_linear_balls():
     """Two far unsaturated balls in line: M = 3H0 / (1 − 3G), G = 2V/(4π d³)."""
     radius, distance, h0 = 1.0, 3.0, 1e-6
     g = 2.0 * (4.0 / 3.0 * np.pi * radius**3) / (4.0 * np.pi * distance**3)
-    found = oracle.equilibrium([[0, 0, 0], [0, 0, distance]], radius, [0, 0, h0], saturation=1.0)
+    result = oracle.equilibrium([[0, 0, 0], [0, 0, distance]], radius, [0, 0, h0], saturation=1.0)
     # in a field of 1e-6 Ms the curve bends by 1e-11 of itself
-    np.testing.assert_allclose(found.magnetizations[:, 2], 3.0 * h0 / (1.0 - 3.0 * g), rtol=1e-9)
+    np.testing.assert_allclose(result.magnetizations[:, 2], 3.0 * h0 / (1.0 - 3.0 * g), rtol=1e-9)
 
 
 @pytest.mark.parametrize("extent", [0.1, 0.03, 0.005])

@@ -78,10 +78,10 @@ def wheel(archive, tmp_path_factory):
 
 
 def uv():
-    found = os.environ.get("UV") or shutil.which("uv")
-    if found is None:
+    result = os.environ.get("UV") or shutil.which("uv")
+    if result is None:
         pytest.skip("needs uv")
-    return found
+    return result
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def environment(archive, tmp_path_factory):
     """A fresh environment with the wheel and what it asks for, in the versions that are here; its ``bin``."""
     folder = tmp_path_factory.mktemp("environment")
     (folder / "versions").write_text(
-        "".join(f"{one.name}=={one.version}\n" for one in metadata.distributions() if one.name != "warpmag")
+        "".join(f"{entry.name}=={entry.version}\n" for entry in metadata.distributions() if entry.name != "warpmag")
     )
     printed([uv(), "venv", "--quiet", "--python", sys.executable, "fresh"], folder)
     place = folder / "fresh" / ("Scripts" if os.name == "nt" else "bin")
@@ -155,7 +155,7 @@ def test_metadata(wheel):
     assert told["License-Expression"] == "Apache-2.0"
     assert told["Author"] == "warpmag contributors"
     assert "Project-URL" not in told
-    assert {f"Programming Language :: Python :: {one}" for one in PYTHONS} <= set(told.get_all("Classifier"))
+    assert {f"Programming Language :: Python :: {python}" for python in PYTHONS} <= set(told.get_all("Classifier"))
     assert (info / "licenses" / "LICENSE").read_text() == (ROOT / "LICENSE").read_text()
 
 

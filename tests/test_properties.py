@@ -84,11 +84,11 @@ def test_scaling(device, seed, count, power):
 def test_superposition(device, seed, count, factor):
     x, radii, m = draw(seed, count)
     other = draw(seed ^ 1, count)[2]
-    both, one, two = (
+    both, first, two = (
         warpmag.h_field(x, moments, radii=radii, device=device, **DOUBLE) for moments in (m + factor * other, m, other)
     )
-    size = np.abs(one).max(initial=0.0) + abs(factor) * np.abs(two).max(initial=0.0)
-    assert np.abs(both - one - factor * two).max(initial=0.0) <= 1e-12 * size
+    size = np.abs(first).max(initial=0.0) + abs(factor) * np.abs(two).max(initial=0.0)
+    assert np.abs(both - first - factor * two).max(initial=0.0) <= 1e-12 * size
 
 
 @ANY
@@ -119,11 +119,11 @@ def test_induction_turns_and_mirrors_with_the_field(device, seed, count, turn, s
     x, radii, _ = draw(seed, count)
     q = rotation(turn)
     field = strength * np.array([0.48, 0.6, 0.64])
-    found = induced(x, radii, field, device)
-    assert found.converged
+    result = induced(x, radii, field, device)
+    assert result.converged
     # the solve ends at a residual of 1e-11, which the inverse Jacobian may amplify in overlapping clumps
-    assert close(induced(x @ q.T, radii, q @ field, device).magnetizations, found.magnetizations @ q.T, 1e-7)
-    assert close(induced(x, radii, -field, device).magnetizations, -found.magnetizations, 1e-7)
+    assert close(induced(x @ q.T, radii, q @ field, device).magnetizations, result.magnetizations @ q.T, 1e-7)
+    assert close(induced(x, radii, -field, device).magnetizations, -result.magnetizations, 1e-7)
 
 
 @ANY
@@ -131,5 +131,5 @@ def test_induction_turns_and_mirrors_with_the_field(device, seed, count, turn, s
 def test_induction_knows_no_length(device, seed, count, power):
     x, radii, _ = draw(seed, count)
     s = 2.0**power
-    found = induced(x, radii, (0.0, 2e5, 0.0), device)
-    assert close(induced(s * x, s * radii, (0.0, 2e5, 0.0), device).magnetizations, found.magnetizations, 1e-9)
+    result = induced(x, radii, (0.0, 2e5, 0.0), device)
+    assert close(induced(s * x, s * radii, (0.0, 2e5, 0.0), device).magnetizations, result.magnetizations, 1e-9)

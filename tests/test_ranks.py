@@ -57,16 +57,16 @@ def calls(tmp_path_factory, device):
 
 
 def test_two_ranks_end_with_the_bits_of_one(calls, device):
-    done, (one, *two) = calls
+    done, (single, *two) = calls
     assert merged(done[0]) == [0]
     first, second = merged(done[1])
     # on a CPU some 14 sums of 3 sizes, and those of the worlds; a GPU shares out those of thousands of moments only
     assert first == second > (40 if device == "cpu" else 4)
     for other in two:
-        assert other.keys() == one.keys() >= {"sweep", "worlds", "multipole force"}
+        assert other.keys() == single.keys() >= {"sweep", "worlds", "multipole force"}
         for name, bits in other.items():
             assert np.isfinite(bits).all(), name
-            assert one[name].tobytes() == bits.tobytes(), name
+            assert single[name].tobytes() == bits.tobytes(), name
 
 
 def test_worlds_of_a_sweep_are_each_its_own(calls):
@@ -148,5 +148,5 @@ def test_a_failure_is_told_in_one_line(output, line, tmp_path):
     command = ["-m", "warpmag.cli", "run", tmp_path / "no.usda" if not output else "falling_magnet", "--device", "cpu"]
     done = start(2, *command, *(["-o", output] if output else []))
     assert done.returncode == 2
-    lines = [one for one in done.stderr.splitlines() if one.startswith("warpmag: ")]
+    lines = [entry for entry in done.stderr.splitlines() if entry.startswith("warpmag: ")]
     assert len(lines) == 1 and line in lines[0], done.stderr

@@ -132,8 +132,8 @@ def test_iron_beside_a_magnet_that_responds(device):
         magnetics.apply(model.state())
         return magnetics.system.magnetizations().numpy(), magnetics.system.converged.numpy().all()
 
-    (fixed, sure), (responding, found) = iron(1.0), iron(1.05)
-    assert sure and found
+    (fixed, sure), (responding, result) = iron(1.0), iron(1.05)
+    assert sure and result
     # inducible moments come first: with recoil the magnet is one of them, the stronger one
     weak = responding[np.linalg.norm(responding, axis=1).argmin()]
     assert weak[2] == pytest.approx(fixed[0, 2] / (1.0 + 0.05 / 3.0), rel=1e-3)

@@ -155,17 +155,17 @@ def test_truncation_error_is_bounded_by_its_estimate():
 
 def test_scale():
     """Lengths times s, fields times f: moments go as s³ f, forces as s² f²."""
-    one = spheres(CLUSTER, RADII, PERMEABILITIES, FIELD, order=5)
+    first = spheres(CLUSTER, RADII, PERMEABILITIES, FIELD, order=5)
     other = spheres(0.005 * CLUSTER, 0.005 * RADII, PERMEABILITIES, 1e6 * FIELD, order=5)
-    np.testing.assert_allclose(other.moments, 0.005**3 * 1e6 * one.moments, rtol=1e-11)
-    np.testing.assert_allclose(other.forces, 0.005**2 * 1e12 * one.forces, rtol=1e-9, atol=1e-12 * 25e6)
+    np.testing.assert_allclose(other.moments, 0.005**3 * 1e6 * first.moments, rtol=1e-11)
+    np.testing.assert_allclose(other.forces, 0.005**2 * 1e12 * first.forces, rtol=1e-9, atol=1e-12 * 25e6)
 
 
 @pytest.mark.parametrize("name, gap", [("chain", 0.02), ("chain", 0.3), ("fcc", 0.2), ("fcc", 0.3)])
 def test_stored_clusters_are_what_is_solved(name, gap):
     rows = [row for row in clusters.load() if (row["cluster"], row["gap"]) == (name, gap)]
-    for found, row in zip(clusters.solve(name, gap).items(), rows, strict=True):
-        key, solution = found
+    for actual, row in zip(clusters.solve(name, gap).items(), rows, strict=True):
+        key, solution = actual
         assert key == (row["permeability"], row["field"])
         # six digits are stored
         np.testing.assert_allclose(row["forces"], solution.forces, atol=1e-5 * np.abs(solution.forces).max())

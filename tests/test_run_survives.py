@@ -39,16 +39,16 @@ def scene(tmp_path_factory):
 def samples(output):
     """All time samples and defaults of a run's cache, the values as bytes."""
     layer = Sdf.Layer.OpenAsAnonymous(str(output.with_name(f"{output.stem}.cache.usdc")))
-    found = {}
+    results = {}
 
     def visit(path):
         if path.IsPropertyPath():
             times = layer.ListTimeSamplesForPath(path)
             values = [layer.QueryTimeSample(path, time) for time in times]
-            found[path] = layer.GetAttributeAtPath(path).default, dict(zip(times, values, strict=True))
+            results[path] = layer.GetAttributeAtPath(path).default, dict(zip(times, values, strict=True))
 
     layer.Traverse("/", visit)
-    return found
+    return results
 
 
 def frames_of(output):
@@ -89,10 +89,10 @@ def first_difference(found, expected):
 
 def assert_begins_like(output, reference):
     """Every sample on the stage is one of the undisturbed run, and none of those up to the last is missing."""
-    found = samples(output)
-    assert found.keys() == reference.keys()
-    last = max((max(times) for _, times in found.values() if times), default=0.0)
-    for path, (default, times) in found.items():
+    actual = samples(output)
+    assert actual.keys() == reference.keys()
+    last = max((max(times) for _, times in actual.values() if times), default=0.0)
+    for path, (default, times) in actual.items():
         before, expected = reference[path]
         assert default == before
         until = {time: value for time, value in expected.items() if time <= last}
@@ -197,9 +197,9 @@ def test_a_resumed_run_ends_with_the_same_bits(scene, tmp_path, device, always, 
 
     expected = run("whole", 9, False)
     for last in (2, 5, 9):
-        found = run("parts", last, True)
-    same = found == expected
-    assert same, first_difference(found, expected)
+        actual = run("parts", last, True)
+    same = actual == expected
+    assert same, first_difference(actual, expected)
     assert sorted(os.listdir(tmp_path / "parts")) == ["out.cache.usdc", "out.usda"]
 
 
@@ -213,7 +213,7 @@ def test_a_resumed_run_keeps_what_was_set(scene, tmp_path, device, always):
         def on_frame(frame):
             if frame == 1:
                 magnetics.set_external_field((0.0, 2e4, 0.0))
-                magnet = next(one for one in magnetics.magnets if one.magnet.kind == "permanent")
+                magnet = next(entry for entry in magnetics.magnets if entry.magnet.kind == "permanent")
                 magnetics.set_magnetization((0.0, 0.0, 7e5), body=magnet.body, shape=int(magnet.shapes[0]))
                 simulation.model.warpmag.saturation.fill_(5e5)
                 magnetics.notify_model_changed()
@@ -224,9 +224,9 @@ def test_a_resumed_run_keeps_what_was_set(scene, tmp_path, device, always):
 
     expected = run("whole", 5, False)
     run("parts", 3, False)
-    found = run("parts", 5, True)
-    same = found == expected
-    assert same, first_difference(found, expected)
+    actual = run("parts", 5, True)
+    same = actual == expected
+    assert same, first_difference(actual, expected)
 
 
 def test_a_scene_edited_in_memory_is_another_scene(scene, tmp_path, device, always):

@@ -46,20 +46,24 @@ def test_every_scene_is_bundled():
 
 
 def test_scenes_hold_what_the_paper_names(report):
-    name, found = report
-    assert [str(finding) for finding in found.findings] == []
-    contents = found.contents
-    counts = len(contents.bodies), len(contents.kinematic), *(len(found.magnets(k)) for k in ("inducible", "permanent"))
+    name, result = report
+    assert [str(finding) for finding in result.findings] == []
+    contents = result.contents
+    counts = (
+        len(contents.bodies),
+        len(contents.kinematic),
+        *(len(result.magnets(k)) for k in ("inducible", "permanent")),
+    )
     assert counts == CONTENTS[name]
     assert contents.settings == MagneticSettings()
-    assert (found.clock.step, found.clock.frames_per_second, found.up_axis) == (1e-3, 60.0, "Z")
-    assert (found.meters_per_unit, found.kilograms_per_unit) == (1.0, 1.0)
+    assert (result.clock.step, result.clock.frames_per_second, result.up_axis) == (1e-3, 60.0, "Z")
+    assert (result.meters_per_unit, result.kilograms_per_unit) == (1.0, 1.0)
 
 
 def test_every_magnet_says_all_of_itself(report):
-    name, found = report
+    name, result = report
     stage = open_stage(bundled()[name])
-    for path in found.contents.magnets:
+    for path in result.contents.magnets:
         prim = stage.GetPrimAtPath(path)
         for attribute in (
             "kind",
@@ -101,19 +105,19 @@ def test_scenes_are_lit_typed_and_filmed_in_their_units(report):
 
 
 def _specs(layer):
-    found = {}
+    results = {}
 
     def visit(path):
         spec = layer.GetObjectAtPath(path)
         if isinstance(spec, Sdf.AttributeSpec):
-            found[str(path)] = spec.default
+            results[str(path)] = spec.default
         elif isinstance(spec, Sdf.RelationshipSpec):
-            found[str(path)] = [str(target) for target in spec.targetPathList.GetAddedOrExplicitItems()]
+            results[str(path)] = [str(target) for target in spec.targetPathList.GetAddedOrExplicitItems()]
         elif isinstance(spec, Sdf.PrimSpec):
-            found[str(path)] = (spec.typeName, str(spec.GetInfo("apiSchemas")), spec.specifier)
+            results[str(path)] = (spec.typeName, str(spec.GetInfo("apiSchemas")), spec.specifier)
 
     layer.Traverse("/", visit)
-    return found
+    return results
 
 
 @pytest.mark.parametrize("name", [pytest.param("alphabets", marks=needs_outlines), *SCENES[1:]])
@@ -162,10 +166,12 @@ def test_letters_of_the_grid_are_apart():
     stage = open_stage(bundled()["alphabets"])
     boxes = UsdGeom.BBoxCache(0.0, [UsdGeom.Tokens.default_, UsdGeom.Tokens.guide])
     ranges = [
-        boxes.ComputeWorldBound(one).ComputeAlignedRange()
-        for one in stage.GetPrimAtPath("/World/Letters").GetChildren()
+        boxes.ComputeWorldBound(entry).ComputeAlignedRange()
+        for entry in stage.GetPrimAtPath("/World/Letters").GetChildren()
     ]
-    lower, upper = (np.array([pick(one) for one in ranges]) for pick in (lambda r: r.GetMin(), lambda r: r.GetMax()))
+    lower, upper = (
+        np.array([pick(entry) for entry in ranges]) for pick in (lambda r: r.GetMin(), lambda r: r.GetMax())
+    )
     apart = np.maximum(lower[:, None] - upper, lower - upper[:, None]).max(axis=2)
     assert apart[~np.eye(100, dtype=bool)].min() > 1e-4
     np.testing.assert_allclose(lower.min(axis=0) + upper.max(axis=0), 0.0, atol=5e-3)
@@ -210,16 +216,16 @@ def test_crystal_balls_have_a_strong_and_a_weak_magnet(tmp_path, strength, field
 def test_other_counts_and_sizes(tmp_path):
     path = tmp_path / "scene.usdc"
     falling_magnet.author(path, balls=61, layers=3, radius=0.003, magnet_radius=0.01, friction=0.2)
-    found = check(path)
-    assert len(found.magnets("inducible")) == 61 and not found.findings
+    result = check(path)
+    assert len(result.magnets("inducible")) == 61 and not result.findings
     sakura_tree.author(path, balls=700, branches=12, radius=0.002, height=0.3, spacing=0.012, seed=1)
-    found = check(path)
-    assert len(found.magnets("inducible")) == 700 and not found.findings
-    assert 3 <= len(found.magnets("permanent")) <= 12
+    result = check(path)
+    assert len(result.magnets("inducible")) == 700 and not result.findings
+    assert 3 <= len(result.magnets("permanent")) <= 12
     assert _least_gap(*_balls(open_stage(path))) > 0.0
     crystal_balls.author(path, columns=5, rows=7, bar=1, bar_rows=1)
-    found = check(path)
-    assert len(found.magnets("inducible")) == 34 and not found.findings
+    result = check(path)
+    assert len(result.magnets("inducible")) == 34 and not result.findings
 
 
 def test_very_many_balls_are_instances_apart(tmp_path):
@@ -233,10 +239,10 @@ def test_very_many_balls_are_instances_apart(tmp_path):
         > 0.0
     )
     assert np.abs(cloud).max(axis=1).min() > 0.0225
-    found = check(make("million", tmp_path, 300))
-    assert [str(finding) for finding in found.findings] == []
-    assert len(found.magnets("inducible")) == 300 and len(found.contents.kinematic) == 1
-    assert found.path.endswith("million_300.usdc")
+    result = check(make("million", tmp_path, 300))
+    assert [str(finding) for finding in result.findings] == []
+    assert len(result.magnets("inducible")) == 300 and len(result.contents.kinematic) == 1
+    assert result.path.endswith("million_300.usdc")
 
 
 def test_a_number_of_balls_only_where_there_is_one(tmp_path):
@@ -267,9 +273,9 @@ def test_saturation_can_be_chosen(tmp_path, author, parameters, body):
 def test_other_letters(tmp_path):
     path = tmp_path / "scene.usdc"
     alphabets.author(path, columns=3, rows=2, layers=1, size=0.05, thickness=0.01)
-    found = check(path)
-    names = [one.rpartition("/")[2] for one in found.magnets("inducible")]
-    assert names == ["A_000", "B_001", "C_002", "D_003", "E_004", "F_005"] and not found.findings
+    result = check(path)
+    names = [magnet.rpartition("/")[2] for magnet in result.magnets("inducible")]
+    assert names == ["A_000", "B_001", "C_002", "D_003", "E_004", "F_005"] and not result.findings
 
 
 @pytest.mark.parametrize(
@@ -306,9 +312,9 @@ def _mass(radius, density=7870.0):
 
 def test_newton_imports_the_falling_magnet(tmp_path):
     falling_magnet.author(tmp_path / "small.usdc", balls=61)
-    newton, builder, found = _imported(tmp_path / "small.usdc")
+    newton, builder, result = _imported(tmp_path / "small.usdc")
     assert builder.body_count == 62 and builder.shape_count == 63
-    magnet = found["path_body_map"]["/World/Magnet"]
+    magnet = result["path_body_map"]["/World/Magnet"]
     masses = np.array(builder.body_mass)
     assert masses[magnet] == pytest.approx(_mass(0.02, 7500.0), rel=1e-5)
     np.testing.assert_allclose(np.delete(masses, magnet), _mass(0.005), rtol=1e-5)
@@ -318,16 +324,16 @@ def test_newton_imports_the_falling_magnet(tmp_path):
 
 def test_newton_imports_the_sakura_tree(tmp_path):
     sakura_tree.author(tmp_path / "small.usdc", balls=100)
-    newton, builder, found = _imported(tmp_path / "small.usdc")
+    newton, builder, result = _imported(tmp_path / "small.usdc")
     assert builder.body_count == 101
-    tree = found["path_body_map"]["/World/Tree"]
+    tree = result["path_body_map"]["/World/Tree"]
     assert builder.body_flags[tree] & int(newton.BodyFlags.KINEMATIC)
     types = np.array(builder.shape_type)[builder.body_shapes[tree]]
     stage = open_stage(tmp_path / "small.usdc")
     assert np.count_nonzero(types == newton.GeoType.SPHERE) == 110
     assert np.count_nonzero(types == newton.GeoType.CAPSULE) == len(types) - 110
     branch = stage.GetPrimAtPath("/World/Tree/Branch_0100")
-    shape = found["path_shape_map"]["/World/Tree/Branch_0100"]
+    shape = result["path_shape_map"]["/World/Tree/Branch_0100"]
     frame = builder.shape_transform[shape]
     matrix = UsdGeom.Xformable(branch).ComputeLocalToWorldTransform(Usd.TimeCode.Default())
     np.testing.assert_allclose(np.array(frame.p), matrix.ExtractTranslation(), atol=1e-6)
@@ -336,11 +342,11 @@ def test_newton_imports_the_sakura_tree(tmp_path):
 
 
 def test_newton_imports_the_letters():
-    newton, builder, found = _imported(bundled()["alphabets"])
+    newton, builder, result = _imported(bundled()["alphabets"])
     assert builder.body_count == 100
     assert np.linalg.norm(builder.gravity) == 0.0
     stage = open_stage(bundled()["alphabets"])
-    center = found["path_shape_map"]["/World/Center"]
+    center = result["path_shape_map"]["/World/Center"]
     boxes = [k for k in range(builder.shape_count) if builder.shape_type[k] == newton.GeoType.BOX]
     filtered = {frozenset(pair) for pair in builder.shape_collision_filter_pairs}
     assert all(frozenset((center, box)) in filtered for box in boxes)
@@ -349,17 +355,17 @@ def test_newton_imports_the_letters():
     np.testing.assert_allclose(np.array(builder.shape_margin)[boxes], 0.03 * 0.005, rtol=1e-6)
     assert all(builder.shape_flags[k] & newton.ShapeFlags.COLLIDE_SHAPES for k in boxes)
     assert not any(builder.shape_flags[k] & newton.ShapeFlags.VISIBLE for k in boxes)
-    first = found["path_body_map"]["/World/Letters/I_008"]
+    first = result["path_body_map"]["/World/Letters/I_008"]
     assert builder.body_mass[first] == pytest.approx(7870.0 * (385.0 / 1493.0) * 0.02**2 * 0.005, rel=1e-5)
     shells = [k for k in range(builder.shape_count) if builder.shape_type[k] == newton.GeoType.MESH]
     assert len(shells) == 100 and stage.GetPrimAtPath("/World/Letters/I_008/Shell")
 
 
 def test_newton_imports_the_crystal_balls():
-    newton, builder, found = _imported(bundled()["crystal_balls"])
+    newton, builder, result = _imported(bundled()["crystal_balls"])
     assert builder.body_count == 179
     assert all(flags & int(newton.BodyFlags.KINEMATIC) for flags in builder.body_flags)
-    bar = found["path_shape_map"]["/World/Magnet"]
+    bar = result["path_shape_map"]["/World/Magnet"]
     np.testing.assert_allclose(builder.shape_scale[bar], (0.0545, 0.016, 0.016), rtol=1e-5)
 
 

@@ -162,30 +162,30 @@ def test_a_state_of_any_arrays_is_saved_and_restored(machine, device, flags):
     rng = np.random.default_rng(1)
     kinds = ((wp.transform, 7, 50), (wp.spatial_vector, 6, 50), (wp.float32, 1, 3), (wp.vec3, 3, 1), (wp.float64, 1, 5))
     values = [rng.normal(size=(count, width)).squeeze() for _, width, count in kinds]
-    own = [wp.array(one, dtype=dtype, device=device) for one, (dtype, _, _) in zip(values, kinds, strict=True)]
+    own = [wp.array(entry, dtype=dtype, device=device) for entry, (dtype, _, _) in zip(values, kinds, strict=True)]
     if flags:
         own.append(wp.array(rng.random(flags) < 0.5, dtype=wp.bool, device=device))
-    saved = [wp.zeros_like(one) for one in own]
+    saved = [wp.zeros_like(entry) for entry in own]
     machine.set_state_arrays(own, saved)
-    before = [one.numpy() for one in own]
+    before = [entry.numpy() for entry in own]
 
     machine.set_status(stepping.STATUS_HALT, stepping.PAUSED)
     machine.begin_step()
-    assert all(not one.numpy().any() for one in saved)
+    assert all(not entry.numpy().any() for entry in saved)
     machine.set_status(stepping.STATUS_HALT, stepping.RUNNING)
     machine.begin_step()
-    for one, expected in zip(saved, before, strict=True):
-        np.testing.assert_array_equal(one.numpy(), expected)
+    for entry, expected in zip(saved, before, strict=True):
+        np.testing.assert_array_equal(entry.numpy(), expected)
 
-    for one in own:
-        one.zero_()
+    for entry in own:
+        entry.zero_()
     machine.restore()  # nothing was rejected yet
-    assert all(not one.numpy().any() for one in own)
+    assert all(not entry.numpy().any() for entry in own)
     report(machine.arrays, 2.0 * TRAVEL, 0.0, 0.0, 0.0, False, 0)
     machine.end_attempt()
     machine.restore()
-    for one, expected in zip(own, before, strict=True):
-        np.testing.assert_array_equal(one.numpy(), expected)
+    for entry, expected in zip(own, before, strict=True):
+        np.testing.assert_array_equal(entry.numpy(), expected)
 
 
 WEIGHT = monitor.UNCONSTRAINED_WEIGHT

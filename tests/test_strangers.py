@@ -75,7 +75,7 @@ def test_nothing_is_fetched_from_a_network(server, kind, tmp_path):
     textured(tmp_path / "scene.usda", address, getattr(Sdf.ValueTypeNames, kind))
     report = check(tmp_path / "scene.usda")
     assert not report.errors
-    assert kind == "String" or any("unresolvable external dependency" in str(one) for one in report.warnings)
+    assert kind == "String" or any("unresolvable external dependency" in str(warning) for warning in report.warnings)
     assert not shapes_with_texture(tmp_path / "scene.usda")
     assert asked == []
 

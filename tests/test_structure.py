@@ -85,13 +85,13 @@ MODULES = {".".join(("warpmag.kernels", *path.with_suffix("").parts)): path for 
 
 def imports(tree) -> list[tuple[str, int]]:
     """Every dotted name that is imported anywhere in a tree, and its line: ``a.b`` for ``from a import b``."""
-    found = []
+    results = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            found += [(alias.name, node.lineno) for alias in node.names]
+            results += [(alias.name, node.lineno) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            found += [("." * node.level + f"{node.module or ''}.{alias.name}", node.lineno) for alias in node.names]
-    return found
+            results += [("." * node.level + f"{node.module or ''}.{alias.name}", node.lineno) for alias in node.names]
+    return results
 
 
 def functions(tree):
@@ -102,7 +102,7 @@ def functions(tree):
 def line_count(node) -> int:
     """Lines of a node, decorators included."""
     decorators = getattr(node, "decorator_list", [])
-    return node.end_lineno - min([node.lineno, *(one.lineno for one in decorators)]) + 1
+    return node.end_lineno - min([node.lineno, *(decorator.lineno for decorator in decorators)]) + 1
 
 
 def docstring_lines(node) -> int:

@@ -173,7 +173,7 @@ def test_an_instance_that_says_nothing_runs(tmp_path, device, capsys):
     errors, _ = told(path, tmp_path, device, capsys, frames=1)
     assert errors == []
     stage, copies = Usd.Stage.Open(str(tmp_path / "out.usda")), ["/World/Copy/Ball", "/World/Moved/Ball"]
-    assert [stage.GetPrimAtPath(one).GetAttribute("radius").Get() for one in copies] == [0.02, R]
+    assert [stage.GetPrimAtPath(copy).GetAttribute("radius").Get() for copy in copies] == [0.02, R]
 
 
 def test_what_newton_complains_of_is_told_in_the_same_words():
@@ -197,8 +197,8 @@ def test_slips_are_warnings_of_both(device, tmp_path, capsys):
     assert errors == []
     expected = {f"{path}: {message}" for path, (_, *messages) in SLIPS.items() for message in messages}
     assert expected <= set(warnings)
-    assert not any(foreign in one for one in warnings for foreign in ("wax:", "warpSceneAPI"))
-    [mesh] = [one for one in warnings if one.startswith("/World/Open: mesh: not closed")]
+    assert not any(foreign in warning for warning in warnings for foreign in ("wax:", "warpSceneAPI"))
+    [mesh] = [warning for warning in warnings if warning.startswith("/World/Open: mesh: not closed")]
     assert "convexHull, is magnetized in its place, and a density gives it the mass of the open mesh" in mesh
 
 

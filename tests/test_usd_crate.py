@@ -58,8 +58,8 @@ def test_usd_reads_what_it_would_write(tmp_path, count):
     file = SampleFile.begin(tmp_path / "hand.usdc", hand.encode(), sizes, 3)
     file.append(1.0, data, np.zeros(0, dtype=int))
     file.close()
-    found = Sdf.Layer.FindOrOpen(str(tmp_path / "hand.usdc"))
-    assert specs(found) == specs(usd)
+    result = Sdf.Layer.FindOrOpen(str(tmp_path / "hand.usdc"))
+    assert specs(result) == specs(usd)
 
 
 @pytest.mark.parametrize("count", [1, 5, 64, 70])
@@ -74,11 +74,11 @@ def test_a_closed_file_has_as_many_references_as_times(tmp_path, count):
         values = np.full((3, 3), number, dtype=np.float32)
         file.append(float(number), values.tobytes(), np.array([0, 2] if number == 1 else [], dtype=int))
     file.close()
-    data, found = path.read_bytes(), []
+    data, result = path.read_bytes(), []
     for head in range(layer.heads, layer.heads + 3 * crate.HEAD, crate.HEAD):
         _, times, jump = struct.unpack_from("<qQq", data, head)
-        found += [struct.unpack_from("<2Q", data, place)[0] for place in (times & (1 << 48) - 1, head + 16 + jump)]
-    assert found == [count if sampled and count > 1 else 0 for sampled in (True, False, True) for _ in range(2)]
+        result += [struct.unpack_from("<2Q", data, place)[0] for place in (times & (1 << 48) - 1, head + 16 + jump)]
+    assert result == [count if sampled and count > 1 else 0 for sampled in (True, False, True) for _ in range(2)]
 
 
 def author(layer, path, type_name, value, uniform=False):
@@ -89,14 +89,14 @@ def author(layer, path, type_name, value, uniform=False):
 
 def specs(layer):
     """All fields of all specs by path; the names of what a spec holds without their order, samples unless empty."""
-    found = {}
+    results = {}
 
     def visit(path):
         spec = layer.GetObjectAtPath(path)
         info = {key: spec.GetInfo(key) for key in spec.ListInfoKeys()}
         if "timeSamples" in info and not layer.ListTimeSamplesForPath(path):
             del info["timeSamples"]
-        found[str(path)] = info
+        results[str(path)] = info
 
     layer.Traverse(Sdf.Path.absoluteRootPath, visit)
-    return found
+    return results

@@ -46,7 +46,7 @@ def posed(order, *operations):
 
 
 def changed(place, corner):
-    return [corner if k == place else one for k, one in enumerate(CORNERS)]
+    return [corner if k == place else entry for k, entry in enumerate(CORNERS)]
 
 
 REFUSED = {
@@ -189,7 +189,7 @@ SOUND = {
 
 @pytest.mark.parametrize("case", SOUND)
 def test_sound(tmp_path, case):
-    assert [str(one) for one in survey(open_stage(write(tmp_path, SOUND[case]))).findings] == []
+    assert [str(finding) for finding in survey(open_stage(write(tmp_path, SOUND[case]))).findings] == []
 
 
 @pytest.mark.parametrize("value", ["1e400", "nan"])
@@ -321,7 +321,7 @@ def Xform "A" (instanceable = true
 )
 def test_time_samples_inside_instances(tmp_path, animated):
     path = write(tmp_path, INSTANCES.replace("BODY", ball(radius=animated)))
-    errors = [str(one) for one in survey(open_stage(path)).findings if one.severity == "error"]
+    errors = [str(finding) for finding in survey(open_stage(path)).findings if finding.severity == "error"]
     assert len(errors) == 1 and errors[0].startswith("/A/Ball: ") and "set instanceable = false on /A" in errors[0]
     path.write_text(path.read_text().replace("instanceable = true", "instanceable = false"))
     stage = open_stage(path)
@@ -362,8 +362,8 @@ def test_what_no_schema_asks_for_is_a_warning(tmp_path):
     body = ball("float physics:mass = 2").replace('"PhysicsMassAPI", ', "")
     body += 'def Material "Rubber"\n{\nfloat physics:density = 900\nfloat physics:restitution = 0.5\n}\n'
     findings = survey(open_stage(write(tmp_path, body))).findings
-    assert {one.severity for one in findings} == {"warning"}
-    assert [str(one) for one in findings] == [
+    assert {finding.severity for finding in findings} == {"warning"}
+    assert [str(finding) for finding in findings] == [
         "/Ball: physics:mass has no effect: the prim has no PhysicsMassAPI",
         "/Rubber: physics:density has no effect: the prim has no PhysicsMassAPI or PhysicsMaterialAPI",
         "/Rubber: physics:restitution has no effect: the prim has no PhysicsMaterialAPI",
@@ -383,8 +383,10 @@ DECLARATIONS = {  # a line in the scene, what is said of it and how gravely
 def test_attributes_that_a_scene_declares(device, tmp_path, capfd, case):
     line, message, severity = DECLARATIONS[case]
     path = write(tmp_path, f'def PhysicsScene "Scene"\n{{\n{line}\n}}\n{ball()}')
-    found = [one for one in survey(open_stage(path)).findings if "newton:my:thing" in one.message]
-    assert {(one.where, one.severity) for one in found if message in one.message} == {("/Scene", severity)}
+    result = [finding for finding in survey(open_stage(path)).findings if "newton:my:thing" in finding.message]
+    assert {(finding.where, finding.severity) for finding in result if message in finding.message} == {
+        ("/Scene", severity)
+    }
     if severity == "warning":
         assert any("newton:my:thing" in line for line in import_scene(path).warnings)
         assert capfd.readouterr().err == ""  # nor does Newton say it again
@@ -435,16 +437,16 @@ def hinged(operation, value):
 )
 def test_a_joint_to_a_frame_that_is_nowhere(tmp_path, operation, value, message):
     report = check(write(tmp_path, hinged(operation, value)))
-    assert [one.where for one in report.errors if message in one.message] == ["/Frame"]
+    assert [error.where for error in report.errors if message in error.message] == ["/Frame"]
 
 
 @pytest.mark.parametrize(("apart", "warned"), [(1e-5, False), (3e-4, True), (0.5, True)])
 def test_ends_of_a_joint_that_are_apart(tmp_path, apart, warned):
     report = check(write(tmp_path, hinged("double3 xformOp:translate", f"({apart}, 0, 0)")))
     assert not report.errors
-    found = [str(one) for one in report.warnings if one.where == "/Joint"]
+    result = [str(entry) for entry in report.warnings if entry.where == "/Joint"]
     warning = f"/Joint: its ends are {apart:g} m apart at the start, and the run begins by pulling them together"
-    assert found == [warning] * warned
+    assert result == [warning] * warned
 
 
 @pytest.mark.parametrize(("place", "apart"), [("(0, 0, 0.5)", 0.0), ("(0.3, 0, 0.5)", 0.3), ("(0, 0.4, 0)", 0.4)])
@@ -452,9 +454,9 @@ def test_ends_of_a_prismatic_joint_may_be_apart_along_its_axis(tmp_path, place, 
     turned = "quatf physics:localRot0 = (0.70710678, 0, -0.70710678, 0)"  # takes X to Z
     joint = hinged("double3 xformOp:translate", place).replace("Revolute", "Prismatic")
     joint = joint.replace(TO_BALL, f'{TO_BALL}\nuniform token physics:axis = "X"\n{turned}')
-    found = [str(one) for one in check(write(tmp_path, joint)).warnings if one.where == "/Joint"]
+    result = [str(entry) for entry in check(write(tmp_path, joint)).warnings if entry.where == "/Joint"]
     warning = f"/Joint: its ends are {apart:g} m apart at the start, and the run begins by pulling them together"
-    assert found == [warning] * (apart > 0)
+    assert result == [warning] * (apart > 0)
 
 
 @pytest.mark.parametrize(
@@ -496,7 +498,7 @@ def test_a_run_that_ends_names_what_pulled(device, tmp_path, monkeypatch):
 def test_a_point_instancer_as_a_collider_of_a_magnet(tmp_path):
     body = ball('def PointInstancer "Shape" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {}', kind="Xform")
     report = check(write(tmp_path, body.replace('"PhysicsCollisionAPI", ', "", 1)))
-    assert [str(one) for one in report.errors] == [
+    assert [str(error) for error in report.errors] == [
         "/Ball: a magnet without colliders that are solid: no shape to magnetize"
     ]
 
@@ -529,7 +531,7 @@ def test_metadata_that_cannot_be_read(tmp_path):
     layer.Export(str(path))
     path.write_bytes(path.read_bytes().replace(b"a note that", b"a n\x80te that"))
     report = check(path)
-    assert [str(one) for one in report.errors] == [f"{path}: documentation cannot be read (text that is not UTF-8)"]
+    assert [str(error) for error in report.errors] == [f"{path}: documentation cannot be read (text that is not UTF-8)"]
 
 
 def test_offsets_of_sublayers_are_no_metadata_to_copy(tmp_path):

@@ -48,7 +48,7 @@ def write(folder, *parts, name="scene.usda"):
 
 
 def instancer(prototypes, indices, positions, lines="", inner=""):
-    targets = ", ".join(f"</World/Many/Kinds/{one}>" for one in prototypes)
+    targets = ", ".join(f"</World/Many/Kinds/{prototype}>" for prototype in prototypes)
     return f"""def Xform "World" {{
     double3 xformOp:translate = (0.1, 0, 0.02)
     double xformOp:rotateZ = 30
@@ -88,16 +88,16 @@ def test_two_hundred_balls_move_as_prims_do(device, tmp_path):
     magnet = MAGNET.replace("def Cube", "def Sphere").replace("double size = 0.03", "double radius = 0.018")
     grid = np.stack(np.meshgrid(range(5), range(5), range(8), indexing="ij"), axis=-1).reshape(-1, 3)
     places = (0.0082 * grid + (0.0002, 0.0001, 0.0) * grid[:, ::-1]).astype(np.float32).tolist()
-    listed = [tuple(one) for one in places]
+    listed = [tuple(place) for place in places]
     many = instancer(["Ball"], [0] * len(listed), listed, inner=BALL)
     single = many[: many.index("def PointInstancer")] + 'def Xform "Many" {\n'
-    single += "".join(placed(BALL, one).replace('"Ball"', f'"Ball{number}"') for number, one in enumerate(listed))
-    found = []
+    single += "".join(placed(BALL, place).replace('"Ball"', f'"Ball{number}"') for number, place in enumerate(listed))
+    results = []
     for name, scene in (("many", many), ("single", single + "}\n}\n")):
         output = tmp_path / f"{name}.out.usda"
         Simulation(write(tmp_path, magnet, scene, name=f"{name}.usda"), device=device).run(3, output=output)
-        found.append(motion(output, range(4)))
-    (poses, moments), (expected, theirs) = found
+        results.append(motion(output, range(4)))
+    (poses, moments), (expected, theirs) = results
     assert poses.shape == (4, 200, 4, 4)
     assert np.abs(poses[3] - poses[0])[:, 3].max() > 1e-3  # they jump
     np.testing.assert_allclose(poses, expected, rtol=0.0, atol=1e-15)  # transforms above bodies, in double precision
@@ -107,7 +107,7 @@ def test_two_hundred_balls_move_as_prims_do(device, tmp_path):
         stage = Usd.Stage.Open(str(tmp_path / "render.usdc"))
         shown = UsdGeom.PointInstancer(stage.GetPrimAtPath("/World/Render/Balls"))
         above = UsdGeom.XformCache(frame).GetLocalToWorldTransform(shown.GetPrim())
-        seen = np.array([above.Transform(one) for one in shown.GetPositionsAttr().Get(frame)])
+        seen = np.array([above.Transform(place) for place in shown.GetPositionsAttr().Get(frame)])
         np.testing.assert_allclose(np.sort(seen, axis=0), np.sort(poses[frame, :, 3, :3], axis=0), atol=1e-6)
 
 
@@ -130,8 +130,8 @@ def test_instances_stand_where_usd_puts_them(tmp_path):
     kinds = UsdGeom.PointInstancer
     expected = many.ComputeInstanceTransformsAtTime(0, 0, kinds.IncludeProtoXform, kinds.IgnoreMask)
     for row, body in ((0, "Ball"), (1, "Box"), (3, "Box")):
-        found = UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath(f"/World/Many/instance{row}/{body}"))
-        np.testing.assert_allclose(np.array(found), np.array(expected[row] * world), atol=1e-6)
+        actual = UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath(f"/World/Many/instance{row}/{body}"))
+        np.testing.assert_allclose(np.array(actual), np.array(expected[row] * world), atol=1e-6)
 
 
 def test_velocities_of_instances_are_those_of_their_bodies(device, tmp_path):
@@ -209,7 +209,7 @@ def test_an_instancer_in_an_instance(tmp_path):
     simulation = Simulation(path)
     simulation.run(1, output=tmp_path / "out.usda")
     result = Usd.Stage.Open(str(tmp_path / "out.usda"))
-    falls = [result.GetPrimAtPath(one).GetAttribute("physics:velocity").Get(1.0)[2] for one in bodies]
+    falls = [result.GetPrimAtPath(body).GetAttribute("physics:velocity").Get(1.0)[2] for body in bodies]
     np.testing.assert_allclose(falls, -9.81 / 60.0, rtol=0.05)
 
 
@@ -298,25 +298,25 @@ def test_alike_balls_are_imported_as_each_would_be_by_itself(tmp_path, monkeypat
     )
     places = "[(0, 0, 0), (0.1, 0, 0), (0.2, 0.1, 0), (0, 0.2, 0.3)]"
     path = write(tmp_path, instancer(["Ball"], [0, 0, 0, 0], places, lines, turned))
-    found = import_scene(path)
-    assert [len(balls.others) for balls in found.identical_balls] == [1, 1]
+    actual = import_scene(path)
+    assert [len(balls.others) for balls in actual.identical_balls] == [1, 1]
     monkeypatch.setattr(scenes, "open_deferred", lambda path, time: (open_stage(path, time), []))
     wanted = import_scene(path)
-    assert found.bodies.keys() == wanted.bodies.keys()
-    assert found.magnets == wanted.magnets
-    one, other = found.builder.finalize(device="cpu"), wanted.builder.finalize(device="cpu")
+    assert actual.bodies.keys() == wanted.bodies.keys()
+    assert actual.magnets == wanted.magnets
+    first, other = actual.builder.finalize(device="cpu"), wanted.builder.finalize(device="cpu")
     for prim, body in wanted.bodies.items():
-        own, (shape,), (own_shape,) = found.bodies[prim], wanted.magnet_shapes[prim], found.magnet_shapes[prim]
-        pose, wanted_pose = one.body_q.numpy()[own].astype(float), other.body_q.numpy()[body].astype(float)
+        own, (shape,), (own_shape,) = actual.bodies[prim], wanted.magnet_shapes[prim], actual.magnet_shapes[prim]
+        pose, wanted_pose = first.body_q.numpy()[own].astype(float), other.body_q.numpy()[body].astype(float)
         np.testing.assert_allclose(pose[:3], wanted_pose[:3], rtol=0.0, atol=1e-7)  # single precision of 0.5 m
         assert abs(abs(pose[3:] @ wanted_pose[3:]) - 1.0) < 1e-6  # of quaternions, which have two signs
-        speeds = [model.body_qd.numpy()[row] for model, row in ((one, own), (other, body))]
+        speeds = [model.body_qd.numpy()[row] for model, row in ((first, own), (other, body))]
         assert np.linalg.norm(speeds[1]) > 0.3
         np.testing.assert_allclose(*speeds, rtol=0.0, atol=1e-6)  # single precision of quaternions
         for name in ("body_mass", "body_inertia", "shape_scale", "shape_material_mu", "shape_gap", "shape_flags"):
             rows = (own, body) if name.startswith("body") else (own_shape, shape)
-            np.testing.assert_array_equal(getattr(one, name).numpy()[rows[0]], getattr(other, name).numpy()[rows[1]])
-        assert one.body_label[own] == one.shape_label[own_shape] == prim
-    assert sorted(map(str, [one.GetPath() for one in found.stage.Traverse()])) == sorted(
-        str(one.GetPath()) for one in wanted.stage.Traverse()
+            np.testing.assert_array_equal(getattr(first, name).numpy()[rows[0]], getattr(other, name).numpy()[rows[1]])
+        assert first.body_label[own] == first.shape_label[own_shape] == prim
+    assert sorted(map(str, [first.GetPath() for first in actual.stage.Traverse()])) == sorted(
+        str(first.GetPath()) for first in wanted.stage.Traverse()
     )

@@ -50,11 +50,11 @@ def test_samples_are_those_that_usd_itself_would_write(tmp_path, stage, planned)
             Sdf.JustCreatePrimAttributeInLayer(reference, at, types[kind], Sdf.VariabilityVarying, False)
             for time, value in enumerate(values[:, index, :3].tolist()):
                 reference.SetTimeSample(at, float(time), kind(*value))
-    found = read(output)
+    actual = read(output)
     for at in (f"{path}.{name}" for path in PATHS for name in (NAMES[0], "warpmag:moment")):
         times = reference.ListTimeSamplesForPath(at)
-        assert found[at] == {time: reference.QueryTimeSample(at, time) for time in times}
-    assert len(found[f"{PATHS[1]}.physics:velocity"]) == count
+        assert actual[at] == {time: reference.QueryTimeSample(at, time) for time in times}
+    assert len(actual[f"{PATHS[1]}.physics:velocity"]) == count
 
 
 def test_a_cache_can_be_edited_and_saved(tmp_path, stage):
@@ -155,8 +155,8 @@ def test_a_run_continues_where_it_ended(tmp_path, stage, monkeypatch):
     with pytest.raises(InputError, match=r"run\.usda: .*another force: kelvin, now zeeman"):
         CacheWriter(stage, output, PATHS, PATHS, options={"force": "zeeman"}).resume()
     with CacheWriter(stage, output, PATHS, PATHS, options={"force": "kelvin"}) as writer:
-        found = writer.resume()
-        assert found.time == 14 / 128 and np.array_equal(found.state["seed"], np.arange(5))
+        result = writer.resume()
+        assert result.time == 14 / 128 and np.array_equal(result.state["seed"], np.arange(5))
         assert_has(output, frames, 15)
         add(writer, frames, range(15, 100))
     assert_has(output, frames, 100)

@@ -313,7 +313,7 @@ def test_validators_of_usd_are_heard(tmp_path):
     report = check(write(tmp_path, unbound, METRES + '\n    defaultPrim = "Ball"'))
     assert [finding.where for finding in report.broken_rules] == ["/Ball"]
     assert "usdShadeValidators:MaterialBindingApiAppliedValidator" in report.broken_rules[0].message
-    assert report.errors == () and report.broken_rules[0].message in [one.message for one in report.warnings]
+    assert report.errors == () and report.broken_rules[0].message in [warning.message for warning in report.warnings]
 
 
 def test_turned_boxes_are_sound(tmp_path):
@@ -342,7 +342,7 @@ def test_samples_that_block_a_value_are_held_as_none(tmp_path):
 def test_messages_are_one_line_however_long_a_name_is(tmp_path):
     name = "n" * 100_000
     findings = survey(open_stage(write(tmp_path, ball("float physics:mass = -1", name=name)))).findings
-    errors = [one for one in findings if one.severity == "error"]
+    errors = [finding for finding in findings if finding.severity == "error"]
     assert len(errors) == 1 and str(errors[0]).startswith("/nnn") and len(str(errors[0])) < 1000
     with pytest.raises(InputError) as caught:
         read_magnets(open_stage(tmp_path / "stage.usda"))

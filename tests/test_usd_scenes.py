@@ -67,14 +67,14 @@ def test_the_script_runs_from_the_command_line(tmp_path):
 def test_newton_imports_balls_up():
     newton = pytest.importorskip("newton")
     builder = newton.ModelBuilder()
-    found = builder.add_usd(open_stage(bundled()["balls_up"]))
+    result = builder.add_usd(open_stage(bundled()["balls_up"]))
     assert builder.body_count == 244 and builder.shape_count == 245
-    assert found["physics_dt"] == 1e-3
-    assert set(read_magnets(open_stage(bundled()["balls_up"])).magnets) == set(found["path_body_map"])
+    assert result["physics_dt"] == 1e-3
+    assert set(read_magnets(open_stage(bundled()["balls_up"])).magnets) == set(result["path_body_map"])
     np.testing.assert_allclose(builder.gravity, (0.0, 0.0, -9.81), rtol=1e-6)
     ball_mass = 7870.0 * 4.0 / 3.0 * math.pi * 0.005**3
-    for path, body in found["path_body_map"].items():
-        shape = found["path_shape_map"][path]
+    for path, body in result["path_body_map"].items():
+        shape = result["path_shape_map"][path]
         if path == "/World/Magnet":
             assert builder.body_flags[body] & int(newton.BodyFlags.KINEMATIC)
             assert builder.shape_type[shape] == newton.GeoType.BOX
@@ -84,7 +84,7 @@ def test_newton_imports_balls_up():
             assert builder.body_mass[body] == pytest.approx(ball_mass, rel=1e-5)
             assert builder.shape_type[shape] == newton.GeoType.SPHERE
             assert builder.shape_scale[shape][0] == pytest.approx(0.005, rel=1e-6)
-    plane = found["path_shape_map"]["/World/Ground"]
+    plane = result["path_shape_map"]["/World/Ground"]
     assert builder.shape_type[plane] == newton.GeoType.PLANE and builder.shape_body[plane] == -1
     assert tuple(builder.shape_scale[plane])[:2] == (0.0, 0.0)  # infinite
     assert set(builder.shape_material_mu) == set(builder.shape_material_restitution) == {0.0}
@@ -97,10 +97,10 @@ def test_newton_takes_y_up_stages_as_they_are(tmp_path):
     text = (tmp_path / "scene.usda").read_text().replace('upAxis = "Z"', 'upAxis = "Y"')
     (tmp_path / "turned.usda").write_text(text.replace("gravityDirection = (0, 0, -1)", "gravityDirection = (0, 0, 0)"))
     builder = newton.ModelBuilder()
-    found = builder.add_usd(open_stage(tmp_path / "turned.usda"), apply_up_axis_from_stage=True)
+    result = builder.add_usd(open_stage(tmp_path / "turned.usda"), apply_up_axis_from_stage=True)
     np.testing.assert_allclose(builder.gravity, (0.0, -9.81, 0.0), rtol=1e-6)
     np.testing.assert_allclose(
-        np.array(builder.body_q[found["path_body_map"]["/World/Magnet"]]),
+        np.array(builder.body_q[result["path_body_map"]["/World/Magnet"]]),
         (0.0, 0.0, 0.08, 0.0, 0.0, 0.0, 1.0),
         atol=1e-7,
     )

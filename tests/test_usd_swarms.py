@@ -54,7 +54,7 @@ def whole(runs, monkeypatch):
 def arrays(recording):
     """What a recording holds of each body and magnet, by name."""
     bodies = zip(recording.positions, recording.rotations, recording.linear, recording.angular, strict=True)
-    values = np.concatenate([np.concatenate(one, axis=-1)[None] for one in bodies])
+    values = np.concatenate([np.concatenate(body, axis=-1)[None] for body in bodies])
     rows = {name: values[:, row] for row, name in enumerate(recording.bodies)}
     moments = {name: recording.moments[:, row] for row, name in enumerate(recording.magnets)}
     return rows, moments, dict(zip(recording.magnets, recording.permanent.tolist(), strict=True))
@@ -67,9 +67,9 @@ def same(found, wanted, atol):
 
 
 def test_an_instancer_says_what_prims_say(runs, whole):
-    one, other = (read_recording(*open_animated(runs / f"{name}.usda")) for name in ("whole", "prims"))
-    np.testing.assert_array_equal(one.codes, other.codes)
-    (rows, moments, permanent), (wanted, theirs, kinds) = arrays(one), arrays(other)
+    first, other = (read_recording(*open_animated(runs / f"{name}.usda")) for name in ("whole", "prims"))
+    np.testing.assert_array_equal(first.codes, other.codes)
+    (rows, moments, permanent), (wanted, theirs, kinds) = arrays(first), arrays(other)
     assert len(rows) == COUNT and min(np.ptp(values[:, 2]) for values in rows.values()) > 3e-3  # they fly
     for name, values in wanted.items():  # quaternions have two signs; one stays what it was from frame to frame
         sign = np.sign((values[:1, 3:7] * rows[name][:1, 3:7]).sum())
@@ -84,13 +84,13 @@ def test_other_readers_find_the_balls_where_prims_are(runs, whole):
     many, kinds = UsdGeom.PointInstancer(stage.GetPrimAtPath("/World/Many")), UsdGeom.PointInstancer
     assert many and not many.GetPrim().GetChild("instance0")
     world = UsdGeom.XformCache(LAST).GetLocalToWorldTransform(many.GetPrim())
-    found = many.ComputeInstanceTransformsAtTime(LAST, LAST, kinds.IncludeProtoXform, kinds.IgnoreMask)
+    actual = many.ComputeInstanceTransformsAtTime(LAST, LAST, kinds.IncludeProtoXform, kinds.IgnoreMask)
     places = UsdGeom.XformCache(LAST)
     for row in range(COUNT):
         prim = prims.GetPrimAtPath(f"/World/Many/instance{row}/{['Ball', 'Ball', 'Shifted'][row % 3]}")
         wanted = np.array(places.GetLocalToWorldTransform(prim))
-        np.testing.assert_allclose(np.array(found[row] * world), wanted, atol=1e-6)
-    middles = np.array([one.ExtractTranslation() for one in found])
+        np.testing.assert_allclose(np.array(actual[row] * world), wanted, atol=1e-6)
+    middles = np.array([entry.ExtractTranslation() for entry in actual])
     reach = 0.004 * np.array([[1.0], [1.0], [1.5]] * 4)
     box = np.array([(middles - reach).min(axis=0), (middles + reach).max(axis=0)])
     np.testing.assert_allclose(np.array(many.GetExtentAttr().Get(LAST)), box, atol=1e-6)
@@ -100,21 +100,23 @@ def test_it_is_checked_and_goes_on_as_prims_do(runs, whole):
     reports = [check(runs / f"{name}.usda") for name in ("whole", "prims")]
     for report in reports:
         assert not report.errors
-        assert {one.message.rpartition(".")[2] for one in report.broken_rules} == {"MissingDefaultPrim]"}  # the scene's
-    one, other = (report.contents for report in reports)
+        assert {first.message.rpartition(".")[2] for first in report.broken_rules} == {
+            "MissingDefaultPrim]"
+        }  # the scene's
+    first, other = (report.contents for report in reports)
     for name in ("bodies", "colliders", "magnets"):
-        assert sorted(getattr(one, name)) == sorted(getattr(other, name)) and len(one.bodies) == COUNT
-    found, wanted = (import_scene(runs / f"{name}.usda", time_code=LAST) for name in ("whole", "prims"))
-    assert (len(found.swarms), len(wanted.swarms)) == (1, 0)
+        assert sorted(getattr(first, name)) == sorted(getattr(other, name)) and len(first.bodies) == COUNT
+    actual, wanted = (import_scene(runs / f"{name}.usda", time_code=LAST) for name in ("whole", "prims"))
+    assert (len(actual.swarms), len(wanted.swarms)) == (1, 0)
     for name in ("body_q", "body_qd"):
-        given = [(getattr(scene.builder, name), scene.bodies) for scene in (found, wanted)]
-        values = [np.array([array[bodies[prim]] for prim in one.bodies]) for array, bodies in given]
+        given = [(getattr(scene.builder, name), scene.bodies) for scene in (actual, wanted)]
+        values = [np.array([array[bodies[prim]] for prim in first.bodies]) for array, bodies in given]
         if name == "body_q":
             values[0][:, 3:] *= np.sign((values[0][:, 3:] * values[1][:, 3:]).sum(axis=1, keepdims=True))
         np.testing.assert_allclose(*values, rtol=1e-6, atol=3e-6)
-    assert found.magnets.initial_moments.keys() == wanted.magnets.initial_moments.keys()
+    assert actual.magnets.initial_moments.keys() == wanted.magnets.initial_moments.keys()
     for prim, moment in wanted.magnets.initial_moments.items():
-        np.testing.assert_allclose(found.magnets.initial_moments[prim], moment, rtol=1e-6)
+        np.testing.assert_allclose(actual.magnets.initial_moments[prim], moment, rtol=1e-6)
 
 
 def test_it_is_played_and_exported_as_prims_are(runs, whole, tmp_path):
@@ -130,7 +132,7 @@ def test_it_is_played_and_exported_as_prims_are(runs, whole, tmp_path):
         stage = Usd.Stage.Open(str(tmp_path / "out.usdc"))
         balls = UsdGeom.PointInstancer(stage.GetPrimAtPath("/World/Render/Balls"))
         above = UsdGeom.XformCache(LAST).GetLocalToWorldTransform(balls.GetPrim())
-        seen = np.array([above.Transform(one) for one in balls.GetPositionsAttr().Get(LAST)])
+        seen = np.array([above.Transform(entry) for entry in balls.GetPositionsAttr().Get(LAST)])
         rows = np.c_[seen, np.array(balls.GetScalesAttr().Get())[:, :1], np.array(balls.GetVelocitiesAttr().Get(LAST))]
         shown.append(rows[np.argsort(rows[:, 0])])
     np.testing.assert_allclose(*poses, atol=1e-6)

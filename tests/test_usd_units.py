@@ -91,7 +91,7 @@ class Author:
         faces = [*front, *back, *top, *below, *ends]
         prim = self.shape("Mesh", path, subdivisionScheme="none")
         mesh = UsdGeom.Mesh(prim)
-        mesh.CreatePointsAttr(Vt.Vec3fArray([Gf.Vec3f(*(self.length * one for one in point)) for point in points]))
+        mesh.CreatePointsAttr(Vt.Vec3fArray([Gf.Vec3f(*(self.length * entry for entry in point)) for point in points]))
         mesh.CreateFaceVertexCountsAttr([4] * len(faces))
         mesh.CreateFaceVertexIndicesAttr([k for face in faces for k in face])
         return prim
@@ -134,13 +134,13 @@ def motion(path):
 
 
 def test_an_artists_table_runs_as_its_twin(device, tmp_path):
-    found = []
+    results = []
     for name, units in (("si", SI), ("artist", ARTIST)):
         path, output = table(tmp_path / f"{name}.usda", units), tmp_path / f"{name}.out.usda"
         assert check(path).findings == ()
         Simulation(path, device=device).run(1, output=output)
-        found.append(motion(output))
-    (places, moments), (theirs, others) = found
+        results.append(motion(output))
+    (places, moments), (theirs, others) = results
     assert places.shape == (2, 8, 3) and np.abs(places[1] - places[0]).max() > 1e-3
     # Nails have come to rest on the table. Later, as discs hit edges, rounding grows without bound.
     np.testing.assert_allclose(theirs, places, rtol=0.0, atol=1e-5)
@@ -271,16 +271,16 @@ def test_every_dimension_of_a_machine(device, tmp_path):
         for number, units in enumerate((SI, GRAMS))
     ]
     for name in ARRAYS:
-        expected, found = (getattr(one.model, name).numpy() for one in models)
+        expected, actual = (getattr(model.model, name).numpy() for model in models)
         assert expected.size
-        np.testing.assert_allclose(found, expected, rtol=2e-6, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(actual, expected, rtol=2e-6, atol=1e-9, err_msg=name)
     for simulation in models:
         for _ in range(6):
             simulation.step()
-    first, second = (one.state.body_q.numpy() for one in models)
+    first, second = (model.state.body_q.numpy() for model in models)
     np.testing.assert_allclose(second, first, rtol=0.0, atol=1e-6)
     points = np.array([(0.0, 0.3, 0.05), (0.01, 0.3, 0.1), (0.0, 0.45, 0.1)])
-    fields = [one.magnetics.h_field(points) for one in models]
+    fields = [model.magnetics.h_field(points) for model in models]
     assert np.linalg.norm(fields[0], axis=1).min() > 1.0  # A/m
     np.testing.assert_allclose(fields[1], fields[0], rtol=1e-5, atol=1e-4)
 
@@ -310,7 +310,7 @@ def test_instances_and_references_are_converted_once(tmp_path):
         prim.SetInstanceable(name == "A")
     stage.Save()
     scene = import_scene(tmp_path / "scene.usda")
-    assert [float(one[0]) for one in scene.builder.shape_scale] == pytest.approx([0.005, 0.005])
+    assert [float(entry[0]) for entry in scene.builder.shape_scale] == pytest.approx([0.005, 0.005])
     places = [tuple(scene.builder.body_q[scene.bodies[f"/World/{name}/Ball"]])[:3] for name in "AB"]
     np.testing.assert_allclose(places, [(0.01, 0.0, 0.0), (0.11, 0.0, 0.0)], atol=1e-8)
     simulation = Simulation(tmp_path / "scene.usda", device="cpu")
@@ -320,15 +320,15 @@ def test_instances_and_references_are_converted_once(tmp_path):
     fallen = [
         end.GetLocalToWorldTransform(result.GetPrimAtPath(f"/World/{name}/Ball")).ExtractTranslation() for name in "AB"
     ]
-    np.testing.assert_allclose([one[0] for one in fallen], (1.0, 11.0), atol=1e-5)
-    assert all(-0.25 < one[1] < -0.2 for one in fallen)  # cm after 1/48 s
+    np.testing.assert_allclose([entry[0] for entry in fallen], (1.0, 11.0), atol=1e-5)
+    assert all(-0.25 < entry[1] < -0.2 for entry in fallen)  # cm after 1/48 s
 
 
 def test_a_unit_that_is_not_set_is_told(tmp_path):
     path = table(tmp_path / "scene.usda", ARTIST)
     path.write_text(path.read_text().replace("metersPerUnit = 0.01", ""))
-    found = survey(open_stage(path)).findings
-    assert [(one.severity, one.message) for one in found] == [
+    result = survey(open_stage(path)).findings
+    assert [(entry.severity, entry.message) for entry in result] == [
         ("warning", "metersPerUnit is not set, which in USD means 0.01: lengths are read in that unit")
     ]
 
@@ -357,7 +357,7 @@ def test_each_attribute_of_newton_with_a_unit_is_converted_or_refused():
     registry, stage = Usd.SchemaRegistry(), Usd.Stage.CreateInMemory()
     types = Tf.Type.FindByName("UsdAPISchemaBase").GetAllDerivedTypes()
     schemas = [name for name in map(Usd.SchemaRegistry.GetSchemaTypeName, types) if name.startswith("Newton")]
-    found, kept = 0, []
+    result, kept = 0, []
     for schema in schemas:
         definition = registry.FindAppliedAPIPrimDefinition(schema)
         prim = stage.DefinePrim(f"/{schema}", "PhysicsPrismaticJoint")
@@ -367,7 +367,7 @@ def test_each_attribute_of_newton_with_a_unit_is_converted_or_refused():
             unit = attribute.GetDocumentation().partition("Units:")[2].lower() if attribute else ""
             if not any(word in unit for word in ("distance", "mass", "force", "effort", "torque")):
                 continue
-            found += 1
+            result += 1
             with contextlib.suppress(InputError):
                 kept += [name] if _exponents(prim, name) == (0, 0) else []
-    assert kept == [] and found > 50
+    assert kept == [] and result > 50

@@ -362,10 +362,10 @@ def test_newton_imports_the_state_that_was_exported(tmp_path, scene):
     bodies, _, frames = write(scene, tmp_path / "run.usda", times)
     for time, (body_q, body_qd, _) in zip(times, frames, strict=True):
         builder = newton.ModelBuilder()
-        found = builder.add_usd(open_stage(tmp_path / "run.usda", 10.0 + 48.0 * time))["path_body_map"]
-        assert set(found) == set(bodies)
+        result = builder.add_usd(open_stage(tmp_path / "run.usda", 10.0 + 48.0 * time))["path_body_map"]
+        assert set(result) == set(bodies)
         for path, q, qd in zip(bodies, body_q, body_qd, strict=True):
-            pose = np.array(builder.body_q[found[path]])
+            pose = np.array(builder.body_q[result[path]])
             pose[3:] *= np.sign(pose[3:] @ q[3:])
             np.testing.assert_allclose(pose, q, atol=FLOAT, err_msg=path)
-            np.testing.assert_allclose(np.array(builder.body_qd[found[path]]), qd, atol=FLOAT, err_msg=path)
+            np.testing.assert_allclose(np.array(builder.body_qd[result[path]]), qd, atol=FLOAT, err_msg=path)

@@ -212,18 +212,18 @@ ARTICULATIONS = {
 @pytest.mark.parametrize("case", ARTICULATIONS)
 def test_an_articulation_moves_as_its_joints_do(case, device, tmp_path):
     """The default solver knows joints one by one: a root above them changes nothing but rounding."""
-    found = []
+    results = []
     for root in ("", '(prepend apiSchemas = ["PhysicsArticulationRootAPI"])'):
         (folder := tmp_path / f"root{len(root)}").mkdir()
         inner = "".join(ARTICULATIONS[case]).replace("World/", "World/R/")
         simulation = Simulation(write(folder, physics(), f'def Xform "R" {root} {{\n{inner}}}\n'), device=device)
         poses, _ = advance(simulation, 0.05)
-        found.append(dict(zip(simulation.model.body_label, poses[:, :3], strict=True)))
-    assert found[0].keys() == found[1].keys() and len(found[0]) >= 3
-    fallen = max(1.0 - pose[2] for pose in found[0].values())
+        results.append(dict(zip(simulation.model.body_label, poses[:, :3], strict=True)))
+    assert results[0].keys() == results[1].keys() and len(results[0]) >= 3
+    fallen = max(1.0 - pose[2] for pose in results[0].values())
     assert fallen > 1e-3
-    for label, pose in found[0].items():
-        np.testing.assert_allclose(found[1][label], pose, atol=2e-3 * fallen, err_msg=label)
+    for label, pose in results[0].items():
+        np.testing.assert_allclose(results[1][label], pose, atol=2e-3 * fallen, err_msg=label)
 
 
 @pytest.mark.parametrize("kept", [True, False])

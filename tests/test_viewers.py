@@ -33,7 +33,7 @@ class Notes:
         self.camera = np.array(position), pitch, yaw
 
     def log_arrows(self, name, starts, ends, colors, width):
-        self.arrows.append([one.numpy() for one in (starts, ends, colors)])
+        self.arrows.append([entry.numpy() for entry in (starts, ends, colors)])
 
     def should_step(self):
         return self.shown not in self.paused
