@@ -80,7 +80,7 @@ def signals_guarded() -> Iterator[None]:
 
 
 def react() -> None:
-    """Tell the guard that Python has reacted to a signal."""
+    """Record that Python has reacted to a signal."""
     if threading.current_thread() is threading.main_thread():
         writer = signal.set_wakeup_fd(-1)
         if writer >= 0:

@@ -111,8 +111,8 @@ class _Operator:
     def entries(self, k: int, j: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the operator's entries of the coupling from component j to component k, and back, shape [entries].
 
-        Slopes reach farther than the coupling. What is left out counts for the moment itself, as if the others were
-        magnetized like it, so that uniform magnetizations have neither slopes nor their energy.
+        Slopes reach farther than the coupling. Omitted entries are added to the diagonal, as if the other cells had the
+        same magnetization, so that uniform magnetizations have neither slopes nor their energy.
         """
         block = self.block(k, j)
         there, back = block[self.row, self.other], block[self.other, self.row]

@@ -42,7 +42,7 @@ def _check_gradients(name: str, system: MomentSystem, sources: ModelSources) -> 
 def _closed_forms_act_on_cells(system: MomentSystem) -> bool:
     """Return False if no permanent body with a closed form is near cells of iron. Waits for the device.
 
-    With coils, or in a captured graph, nobody can tell.
+    With coils, or in a captured graph, their distance is not tested: True.
     """
     interaction, sources = system.source_interaction, system.sources
     if interaction is None or not interaction.cell_count:

@@ -10,7 +10,7 @@ from warpmag.usd.values import Finding
 
 
 def with_mujoco_field(prim: Usd.Prim, settings: MagneticSettings) -> tuple[MagneticSettings, list[Finding]]:
-    """Return the settings of a PhysicsScene with the flux of MJCF as external field, and a warning that says so.
+    """Return the settings of a PhysicsScene with the flux of MJCF as external field, and a warning about it.
 
     An authored ``warpmag:externalField`` takes precedence. A flux that is not finite raises :class:`InputError`.
     """
