@@ -152,12 +152,30 @@ template <class Vectors> CUDA_CALLABLE inline void add_real3(const Vectors& to, 
     put_real3(to, i, real3((const Real*)to.data + 3 * (size_t)i) + v);
 }
 CUDA_CALLABLE inline Real3 first_lane(Vector v) { return {lane_of(v.x, 0), lane_of(v.y, 0), lane_of(v.z, 0)}; }
-// Closed form of a body's field at the center of a cell, in all lanes.
-CUDA_CALLABLE inline TargetField center_field(const Cell& cell, const PermanentBody& body) {
-    const Vector at = body.frame.point_to_body(broadcast(cell.center));
-    const Number least2 = Number(Real(0)) + Real(0.25) * cell.radius * cell.radius;
-    const TargetField f = target_field(body.frame.to_world(field_of(body.solid, body.m, at, least2, share(), SHARES)));
-    return {group_sums(f.h), group_sums(f.x), group_sums(f.y), group_sums(f.z)};
+// Field of body b at the center of a cell, in all lanes: its closed form, or the field of its moments in the system and
+// the ``correction`` of that field, with the derivatives that the pass over targets has written. The latter if the body
+// is the only source.
+template <class Arrays>
+CUDA_CALLABLE inline TargetField center_field(const Arrays& arrays, const Cell& cell, int b, const PermanentBody& body,
+                                              Real3 correction) {
+    const Number zero = Number(Real(0)), radius = zero + cell.radius;
+    const bool only = arrays.only.data[arrays.coils.kind.shape[0] + b];
+    TargetField f = target_field(
+        only ? INVERSE_4PI * lattice_field(arrays, body, broadcast(cell.center), radius, zero == 0, share(), SHARES)
+             : body.frame.to_world(field_of(body.solid, body.m, body.frame.point_to_body(broadcast(cell.center)),
+                                            Real(0.25) * radius * radius, share(), SHARES)));
+    f = {group_sums(f.h), group_sums(f.x), group_sums(f.y), group_sums(f.z)};
+    if (!only) return f;
+    auto along = [&](const auto& array) { return broadcast(real3((const Real*)array.data + 3 * (size_t)cell.moment)); };
+    f.h += broadcast(correction), f.x += along(arrays.targets.along_x);
+    f.y += along(arrays.targets.along_y), f.z += along(arrays.targets.along_z);
+    return f;
+}
+// A field at the center of a cell without the external field.
+template <class Arrays, class Field>
+CUDA_CALLABLE inline Real3 without_base(const Arrays& arrays, const Cell& cell, const Field& field) {
+    const size_t at = 3 * (size_t)cell.moment;
+    return real3((const Real*)field.data + at) - real3((const Real*)arrays.targets.base.data + at);
 }
 
 // Half the difference of a body's field between the halves of a cell along its axes, of the components along them.
@@ -191,6 +209,7 @@ template <class Arrays> CUDA_CALLABLE inline void average_over_cell(const Arrays
     const Real* const units = arrays.cells.point.data;
     Real* const potential = arrays.cells.potential.data + OUTER_POINTS * (size_t)c;
     Real3 field = {0, 0, 0}, acting = field, acting_mean = field, steepness = field;
+    const Real3 correction = without_base(arrays, cell, arrays.targets.field);
     int nearness = FAR_CELL;
     const PointRange range = fine_points();
     for (int b = cell.first; b < cell.last; ++b) {
@@ -212,7 +231,8 @@ template <class Arrays> CUDA_CALLABLE inline void average_over_cell(const Arrays
                 put(potential + k, (nearness == NEAR_CELL ? numbers(potential + k) : 0 * phi) + fade.fine.weight * phi);
         }
         const Real3 average = cell.to_world(total_of(means));
-        const Real3 change = fade.fine.weight * (average - first_lane(center_field(cell, body).h));
+        const Real3 change =
+            fade.fine.weight * (average - first_lane(center_field(arrays, cell, b, body, correction).h));
         field += change;
         steepness += fade.fine.weight * total_of(differences);
         if (acts) acting += change, acting_mean += fade.fine.weight * average, nearness = NEAR_CELL;
@@ -316,8 +336,9 @@ CUDA_CALLABLE inline Wrench wrench_on_charges(const Cell& cell, const PermanentB
 }
 // Adds force/μ0 and torque/μ0 about the center of cell c by a body, less those of its field at the center.
 template <class Arrays>
-CUDA_CALLABLE inline void add_cell_wrench(const Arrays& arrays, const Cell& cell, int c, const PermanentBody& body,
-                                          Real3& force, Real3& torque) {
+CUDA_CALLABLE inline void add_cell_wrench(const Arrays& arrays, const Cell& cell, int c, int b, Real3& force,
+                                          Real3& torque) {
+    const PermanentBody body = body_at(arrays, b);
     const CellFades fade = cell_fades(cell, body);
     if ((fade.fine.weight == 0 && fade.coarse.weight == 0) || body.label == cell.label) return;
     const Real* const units = arrays.cells.point.data;
@@ -338,7 +359,9 @@ CUDA_CALLABLE inline void add_cell_wrench(const Arrays& arrays, const Cell& cell
     const Real* const potential = arrays.cells.potential.data + OUTER_POINTS * (size_t)c;
     const Real3 responding = along - response_moment(cell, potential, units); // potentials lack the average field
     const Wrench w = wrench_on_charges(cell, body, cylinder, units, fine_points(), responding, difference, potential);
-    const TargetField at_center = center_field(cell, body);
+    const Real3 change = real3((const Real*)arrays.cells.change.data + 3 * (size_t)c);
+    const Real3 correction = without_base(arrays, cell, arrays.targets.acting) - change;
+    const TargetField at_center = center_field(arrays, cell, b, body, correction);
     const Real3 h = first_lane(at_center.h), f = first_lane(gradient_dot(at_center, broadcast(m)));
     add(fade.fine, total_of(w.force) - f, total_of(w.torque) - cross(m, h), total_of(w.energy) + dot(m, h));
 }
@@ -355,7 +378,7 @@ template <class Arrays> CUDA_CALLABLE inline void act_on_cell(const Arrays& arra
     const Real3 m = effective_at(arrays.effective.data, pitch, cell.moment);
     const Real3 change = real3((const Real*)arrays.cells.change.data + 3 * (size_t)c);
     Real3 force = {0, 0, 0}, torque = cross(change, m);
-    for (int b = cell.first; b < cell.last; ++b) add_cell_wrench(arrays, cell, c, body_at(arrays, b), force, torque);
+    for (int b = cell.first; b < cell.last; ++b) add_cell_wrench(arrays, cell, c, b, force, torque);
     if (share() != 0) return;
     if (only) {
         Real* const wrench = arrays.cells.wrench.data + 6 * (size_t)c;
@@ -367,12 +390,12 @@ template <class Arrays> CUDA_CALLABLE inline void act_on_cell(const Arrays& arra
     add_real3(arrays.cells.torques, cell.moment, MU0 * torque);
 }
 
-// Force/μ0 on cells ``first`` to ``last`` − 1 by a body, and their torque/μ0 about its reference point. If the body is
+// Force/μ0 on cells ``first`` to ``last`` − 1 by body b, and their torque/μ0 about its reference point. If the body is
 // the only source, :func:`act_on_cell` has written them.
 template <class Arrays>
-CUDA_CALLABLE inline void wrench_on_cells(const Arrays& arrays, const PermanentBody& body, bool only, int first,
-                                          int last, Real3& force, Real3& torque) {
-    const Real3 center = reference_point(arrays, body);
+CUDA_CALLABLE inline void wrench_on_cells(const Arrays& arrays, int b, bool only, int first, int last, Real3& force,
+                                          Real3& torque) {
+    const Real3 center = reference_point(arrays, body_at(arrays, b));
     for (int c = first; c < last; ++c) {
         if (!arrays.cells.near.data[c]) continue;
         Real3 f = {0, 0, 0}, t = f;
@@ -380,7 +403,7 @@ CUDA_CALLABLE inline void wrench_on_cells(const Arrays& arrays, const PermanentB
             const Real* const wrench = arrays.cells.wrench.data + 6 * (size_t)c;
             f = real3(wrench), t = real3(wrench + 3);
         } else {
-            add_cell_wrench(arrays, cell_at(arrays, c), c, body, f, t);
+            add_cell_wrench(arrays, cell_at(arrays, c), c, b, f, t);
         }
         force += f;
         torque += t + cross(packed_real3(arrays, 0, arrays.cells.cell.data[c][0]) - center, f);

@@ -167,7 +167,7 @@ template <class Arrays> CUDA_CALLABLE inline void react(const Arrays& arrays, in
         const Wrench wrench = wrench_on_targets(arrays, s, body, range[1], range[2]);
         force = total_of(wrench.force), torque = total_of(wrench.torque);
     } else if (CELLS && range[3] == OF_CELLS) {
-        if constexpr (CELLS) wrench_on_cells(arrays, body, arrays.only.data[s], range[1], range[2], force, torque);
+        if constexpr (CELLS) wrench_on_cells(arrays, s - coils, arrays.only.data[s], range[1], range[2], force, torque);
     } else if constexpr (BALLS) {
         const Real3 center =
             s < coils ? real3((const Real*)arrays.coils.frame.data + 7 * (size_t)s) : reference_point(arrays, body);
