@@ -176,3 +176,35 @@ def test_bodies_that_move_together_keep_their_tensors(device):
     system.solve()
     changed = np.abs(system._cell_pairs.arrays.matrix.numpy() - before).max()
     assert changed <= 1e-4 * np.abs(before).max()  # poses that rounding moves by more than the tolerance
+
+
+def test_pairs_that_leave_and_enter_the_window(device):
+    """Fields after small motions through the end of the window equal those after a search."""
+    bodies, ends = [CUBE, PLATE], set()
+
+    def poses(height):
+        return [(Rotation.identity(), np.zeros(3)), (Rotation.identity(), np.array([0.002, 0.001, height]))]
+
+    system, _ = make_pair(bodies, poses(0.027), dtype="float32", device=device, susceptibility=math.inf)
+    system.solve()
+    pairs = system._cell_pairs
+
+    def field():
+        pairs.arrays.h.zero_()
+        pairs.add_field()
+        return pairs.arrays.h.numpy()
+
+    for height in (0.0275, 0.028, 0.0285, 0.0275, 0.027):
+        put(system, bodies, poses(height))
+        system.begin()
+        kept, searched = field(), pairs.arrays.searching.numpy()[0]
+        ends.add(int(pairs.arrays.near_end.numpy().max()))
+        if height == 0.027:
+            pairs.request_search(wp.ones(1, dtype=int, device=device))
+            pairs.find()
+            expected = field()
+            # tensors are kept up to changes of 3e-5 sizes
+            np.testing.assert_allclose(kept, expected, atol=1e-4 * np.abs(expected).max())
+        elif device == "cpu":
+            assert searched == 0  # the lists are those of the first pose
+    assert len(ends) > 1  # slots leave and enter the window
