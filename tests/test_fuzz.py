@@ -10,7 +10,8 @@ import time
 
 import pytest
 from fuzz import campaign, truth
-from fuzz.campaign import BAD_INPUT, Campaign, Verdict, in_process, judge, make
+from fuzz.campaign import BAD_INPUT, OK, Campaign, Verdict, in_process, judge, make
+from fuzz.resumes import author_runs, judge_resume
 from fuzz.sources import author
 from pxr import Usd
 from small_stages import physics, write
@@ -44,6 +45,17 @@ def test_spoiled_stages_are_refused_or_run(numbers, device, sources, tmp_path):
     assert [(verdict.number, verdict.done, verdict.problems) for verdict in verdicts if verdict.problems] == []
     refused = sum(verdict.run == BAD_INPUT for verdict in verdicts)
     assert len(numbers) // 5 < refused < len(numbers)  # the mutator does neither too little nor too much
+
+
+@pytest.mark.no_cover
+def test_spoiled_runs_are_refused_or_resumed(device, sources, tmp_path):
+    """Also by the values of a run that nobody interrupted."""
+    if device != "cpu":
+        pytest.skip("bits are compared")
+    runs = author_runs(sources[:1], tmp_path / "runs")
+    verdicts = [judge_resume(number, SEED, tmp_path, runs, in_process) for number in range(12)]
+    assert [(verdict.number, verdict.done, verdict.problems) for verdict in verdicts if verdict.problems] == []
+    assert {verdict.run for verdict in verdicts} == {OK, BAD_INPUT}
 
 
 WEIGHS = {

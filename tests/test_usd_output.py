@@ -154,11 +154,17 @@ def test_a_run_continues_where_it_ended(tmp_path, stage, monkeypatch):
     assert sorted(os.listdir(tmp_path)) == ["run.cache.usdc", "run.resume.npz", "run.usda", "scene.usda"]
     with pytest.raises(InputError, match=r"run\.usda: .*another force: kelvin, now zeeman"):
         CacheWriter(stage, output, PATHS, PATHS, options={"force": "zeeman"}).resume()
+    before = (tmp_path / "run.cache.usdc").read_bytes(), output.read_bytes()
+    unused = CacheWriter(stage, output, PATHS, PATHS, options={"force": "kelvin"})
+    assert unused.resume() is not None
+    unused.close(complete=False)  # its state did not fit
+    assert before == ((tmp_path / "run.cache.usdc").read_bytes(), output.read_bytes())
     with CacheWriter(stage, output, PATHS, PATHS, options={"force": "kelvin"}) as writer:
         result = writer.resume()
         assert result.time == 14 / 128 and np.array_equal(result.state["seed"], np.arange(5))
-        assert_has(output, frames, 15)
-        add(writer, frames, range(15, 100))
+        add(writer, frames, [15])
+        assert_has(output, frames, 16)
+        add(writer, frames, range(16, 100))
     assert_has(output, frames, 100)
     again = CacheWriter(stage, output, PATHS, PATHS, options={"force": "kelvin"})
     assert again.resume().state is None

@@ -63,8 +63,9 @@ def judge_resume(number: int, seed: int, folder: Path, runs: list[Path], command
         verdict.problems.append(f"ends with {verdict.run}: {verdict.line}")
     elif len(refusals) != 1:
         verdict.problems.append(f"{len(refusals)} lines")
-    elif before == _content(run / "part", without=_CHECKPOINT) and _frames(output) != LAST + 1:
-        verdict.problems.append(f"a refused run left {_frames(output)} frames")
+    elif _stage_kept(place, run) and before == _content(run / "part", without=_CHECKPOINT):
+        if (frames := _frames(output)) != LAST + 1:
+            verdict.problems.append(f"a refused run left {frames} frames")
     verdict.seconds = cpu_seconds() - began
     return verdict
 
@@ -81,7 +82,7 @@ def _content(folder: Path, without: str) -> dict[str, bytes]:
 
 def _frames(output: Path) -> int:
     """Return the number of frames of a result."""
-    return max(len(samples) for samples in _samples(Usd.Stage.Open(str(output))).values())
+    return max((len(samples) for samples in _samples(Usd.Stage.Open(str(output))).values()), default=0)
 
 
 def _problems(output: Path, expected: Path | None) -> list[str]:

@@ -68,6 +68,7 @@ class SampleFile:
         self._offsets = (np.cumsum(sizes) - sizes).astype(np.uint64)
         self._frame_size = int(np.sum(sizes))
         self._ahead = 0  # rows that have references of frames beyond ``filled``
+        self.resumed = False  # True until a resumed file has dropped the frames after its checkpoint
         self._row_count = -1  # number of samples in the rows; -1 where an earlier run may have closed the file
 
     @classmethod
@@ -90,9 +91,9 @@ class SampleFile:
 
     @classmethod
     def resume(cls, path: str | os.PathLike, sizes: np.ndarray, places: dict[str, np.ndarray]) -> "SampleFile":
-        """Continue a file from an earlier :meth:`places`; later frames are dropped.
+        """Open a file at an earlier :meth:`places`; :meth:`drop_later_frames` has to come before the next frame.
 
-        A file that has changed, or the places in another file, raise :class:`InputError`, and nothing is written.
+        Nothing is written. A file that has changed, or the places in another file, raise :class:`InputError`.
         """
         with contextlib.ExitStack() as stack:
             file = stack.enter_context(open(path, "r+b", buffering=0))
@@ -105,11 +106,16 @@ class SampleFile:
                 intact = False
             if not intact:
                 raise InputError(f"{path}: cannot be resumed, it has changed since the run wrote it")
-            self._set_count(float(self.codes()[-1]))
-            self._write_heads(0, len(sizes))
-            self._fill_rows(0, self._places.filled, 0, len(sizes))
+            self.resumed = True
             stack.pop_all()
         return self
+
+    def drop_later_frames(self) -> None:
+        """Bring a resumed file back to its places."""
+        self.resumed, attributes = False, len(self._offsets)
+        self._set_count(float(self.codes()[-1]))
+        self._write_heads(0, attributes)
+        self._fill_rows(0, self._places.filled, 0, attributes)
 
     @property
     def sampled(self) -> np.ndarray:
@@ -173,7 +179,13 @@ class SampleFile:
         return np.frombuffer(os.pread(self._file.fileno(), 8 * self.count, self._places.times + 8))
 
     def close(self) -> None:
-        """Close the file with the counts of samples in all rows, as readers other than USD's expect."""
+        """Close the file with the counts of samples in all rows, as readers other than USD's expect.
+
+        A resumed file with later frames stays as it is.
+        """
+        if self.resumed:
+            self._file.close()
+            return
         try:
             counts = np.where(self.sampled, self.count, 0).tolist()
             for row, count in zip(self._rows(), counts, strict=True):

@@ -164,20 +164,19 @@ class CacheWriter:
         places = {name[5:]: array for name, array in arrays.items() if name.startswith("file/")}
         state = {name[6:]: array for name, array in arrays.items() if name.startswith("state/")}
         with output.errors(output.cache):
-            samples = SampleFile.resume(output.cache, self._value_sizes(), places)
-        try:
-            self._check_cache()
-        except InputError:
-            samples.close()
-            raise
-        self._samples = samples
+            self._samples = SampleFile.resume(output.cache, self._value_sizes(), places)
         self._first = self._unpack(self._samples.frame(0))
         self._last = self._unpack(self._samples.frame(self._samples.count - 1))
         self._last_time = float(run["time"])
-        for target in self._write_scene_and_root():
-            output.place(target)
-        output.place(output.root)
         return PreviousRun(self._last_time, state)
+
+    def _drop_later_frames(self, samples: SampleFile) -> None:
+        """Bring the files of a resumed run back to its checkpoint. A run that is refused does not come here."""
+        with self._output.errors(self._output.cache):
+            samples.drop_later_frames()
+        self._check_cache()
+        for target in (*self._write_scene_and_root(), self._output.root):
+            self._output.place(target)
 
     def _check_cache(self) -> None:
         """Raise :class:`InputError` if USD cannot read the cache, for example after damage to the disk."""
@@ -244,6 +243,8 @@ class CacheWriter:
         if self._samples is None:
             self._samples = self._begin(time, values)
         else:
+            if self._samples.resumed:
+                self._drop_later_frames(self._samples)
             self._append(self._samples, time, values)
 
     @property
@@ -272,6 +273,11 @@ class CacheWriter:
         try:
             if samples is None:
                 return
+            if samples.resumed and not complete:
+                samples.close()
+                return
+            if samples.resumed:
+                self._drop_later_frames(samples)
             # the error that ended an incomplete run is the one to report
             with contextlib.nullcontext() if complete else contextlib.suppress(InputError):
                 with output.errors(output.cache):
