@@ -9,7 +9,7 @@
 // From Python: WINDOW_BEGIN, WINDOW_END, CLOSE_BEGIN and CLOSE_END, distances of the windows.
 #pragma once
 #include "cells/box_field.h"
-#include "cells/rotation.h"
+#include "cells/thickened.h"
 #include "pairs/pair_law.h"
 
 namespace warpmag {
@@ -94,8 +94,7 @@ constexpr Points ALL_POINTS = {0, POINTS};
 // along each axis, times a factor: the points are farther apart than the centers of the halves. So half the difference
 // of a linear field between the halves is exact.
 template <class Visit> CUDA_CALLABLE inline void for_gauss_points(Vector h, Points points, Visit visit) {
-    constexpr Real PLACE = Real(0.5773502691896258);
-    constexpr Real SIGN = Real(0.5) / PLACE, STEP = PLACE / SIGN;
+    constexpr Real SIGN = Real(0.5) / GAUSS_PLACE, STEP = GAUSS_PLACE / SIGN;
     for (int k = points.first; k < points.first + points.count; ++k) {
         const Real signs[3] = {k & 1 ? SIGN : -SIGN, k & 2 ? SIGN : -SIGN, k & 4 ? SIGN : -SIGN};
         visit(Vector{STEP * signs[0] * h.x, STEP * signs[1] * h.y, STEP * signs[2] * h.z}, signs);
@@ -179,6 +178,7 @@ struct SourceAndTarget {
         center = choose(own, -to_body(p.rotation, p.r), p.r);
         for (int k = 0; k < 3; ++k)
             for (int l = 0; l < 3; ++l) rotation.rows[k][l] = own ? p.rotation.rows[l][k] : p.rotation.rows[k][l];
+        half = thickened(half, target_half, center, rotation);
         const Number volume = 8 * half.x * half.y * half.z;
         scale = Real(1.0 / 8) / (is_ball ? zero + 1 : volume);
     }
