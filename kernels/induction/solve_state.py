@@ -36,8 +36,10 @@ class World:
     used: int  # number of changes that the next step mixes
     is_best: int  # 1 if the last iterate is the best so far
     plain_steps: int  # steps left without mixing
+    stalled: int  # evaluations since ``reduced``
     apart: int  # solves left without steps of bodies as a whole (``body_steps``), since a step was rejected
     ahead: wp.float64  # factor β of the last change from solve to solve in the next start
+    reduced: wp.float64  # last merit that was less than ``REDUCTION`` of the one before
     best: wp.float64  # smallest merit of this solve, negative before the first evaluation
     alpha: wp.types.vector(DEPTH, wp.float64)  # Anderson coefficients
     slowness: wp.float64  # predicted sum of the remaining steps over the last step

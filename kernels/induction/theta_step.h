@@ -8,6 +8,8 @@ namespace warpmag {
 constexpr int PLAIN_STEPS = DEPTH + 1; // plain steps after an accelerated step was rejected
 constexpr int APART = 32;              // solves without steps of bodies as a whole after a step was rejected
 constexpr double WHOLE_STEP = 0.6;     // step length of balls without overlap
+constexpr int STALLED = 100;           // evaluations without a reduction after which a solve ends unconverged
+constexpr double REDUCTION = 0.9;      // of the merit, that counts
 constexpr double SLOWEST = 20.0;       // largest error amplification by slow convergence
 constexpr double LEAST = 0.01;         // lower bound of an error, as a fraction of the last change
 constexpr double REMEMBERED = 0.5;     // fraction of the slowness that is kept at an evaluation
@@ -81,6 +83,18 @@ CUDA_CALLABLE inline bool mix(World& world, const History& history, const double
     return true;
 }
 
+// Counts the evaluations since the merit was reduced. Returns true if the solve ends: where the operator is not
+// positive, as for a thin sheet in a plate of large cells, steps lead nowhere.
+template <class World> CUDA_CALLABLE inline bool stalls(World& world, double merit) {
+    if (world.best < 0.0 || merit < REDUCTION * world.reduced) {
+        world.reduced = merit;
+        world.stalled = 0;
+    } else {
+        world.stalled += 1;
+    }
+    return world.stalled >= STALLED;
+}
+
 // Error after the last step over the residual before it, by the estimate of theta_flow.py.
 template <class World>
 CUDA_CALLABLE inline double amplification(const World& world, const double* sums, double merit, bool mixed) {
@@ -106,7 +120,7 @@ template <class State> CUDA_CALLABLE inline void choose_step(State& state, int w
     auto& world = state.worlds.data[w];
     const History history = history_of(world);
     const double merit = wp::sqrt(sums[MERIT]), residual = relative_residual(sums[DEVIATION], sums[GOAL]);
-    const bool finite = wp::isfinite(merit), failed = world.best < 0.0 && !finite;
+    const bool finite = wp::isfinite(merit), failed = (world.best < 0.0 && !finite) || stalls(world, merit);
     const bool no_field = world.evaluations == 0 && !world.in_field;
     update_estimates(world, history, sums, merit);
     const bool mixed = mix(world, history, sums, merit, finite);

@@ -199,7 +199,8 @@ def solve_induction(
         method: Summation of fields: ``direct``, over all pairs; ``fmm``, the fast multipole method with errors that
             ``rtol`` allows; ``auto``, the faster of the two.
         rtol: Relative error of the magnetizations at which the solve ends.
-        max_evaluations: Field evaluations after which the solve ends unconverged.
+        max_evaluations: Field evaluations after which the solve ends unconverged. It ends before if 100 of them do not
+            reduce the residual by a tenth.
         initial: Magnetizations to start from [A/m], shape [n, 3].
         dtype: ``float32`` or ``float64``.
         device: Warp device; None means the device of the arrays, or Warp's default.
@@ -241,6 +242,7 @@ def solve_induction(
             curve, points = _read_points(curve, curve_points)
             arguments |= points
         if tape is not None:
+            settings.check(dtype_name(context.dtype))
             _check_differentiable(settings, arguments)
         material = _read_material(balls.count, saturation, susceptibility, curve)
         system = balls.make_system(context, material, settings, initial)
@@ -380,8 +382,7 @@ def _read_result(
     _check_strength(dtype, strongest, saturations)
     converged = bool(system.converged.numpy().all())
     if not converged:
-        limit = system.settings.max_evaluations
-        text = f"error {error:.2g} > rtol {system.rtol:g} after max_evaluations = {limit}"
+        text = f"error {error:.2g} > rtol {system.rtol:g} after {int(system.evaluations.numpy().max())} evaluations"
         warn_caller(f"solve_induction: did not converge, {text}", ConvergenceWarning)
     field_error = system.field_error()
     if field_error > system.rtol:

@@ -117,7 +117,8 @@ class Magnetics:
             rtol: Relative magnetization error at which the induction solve ends.
             external_field: Uniform applied field H0 [A/m], world frame. By default the option ``magnetic`` of an
                 imported MJCF, B/μ0, with a warning; else none.
-            max_evaluations: Field evaluations after which an unconverged induction solve ends.
+            max_evaluations: Field evaluations after which an unconverged induction solve ends. It ends before if 100
+                evaluations do not reduce the residual by a tenth.
             curve: Magnetization curve of all magnets, see :func:`warpmag.add_inducible`; by default each magnet's own.
             dt: Longest time between calls of :meth:`apply` [s]. Drag by eddy currents is limited so that it stops no
                 body within this time.
@@ -533,8 +534,8 @@ class Magnetics:
         """Warn if the last solve did not converge; waits for the device."""
         if self.converged.numpy().all():
             return
-        error, limit = float(self.error.numpy().max()), self.system.settings.max_evaluations
-        text = f"Magnetics: did not converge, error {error:.2g} > rtol {self.rtol:g} after max_evaluations = {limit}"
+        error, count = float(self.error.numpy().max()), int(self.evaluations.numpy().max())
+        text = f"Magnetics: did not converge, error {error:.2g} > rtol {self.rtol:g} after {count} evaluations"
         warn_caller(text, ConvergenceWarning)
 
     def energy(self) -> np.ndarray:
