@@ -8,16 +8,14 @@ namespace warpmag {
 constexpr int PLAIN_STEPS = DEPTH + 1; // plain steps after an accelerated step was rejected
 constexpr int APART = 32;              // solves without steps of bodies as a whole after a step was rejected
 constexpr double WHOLE_STEP = 0.6;     // step length of balls without overlap
-constexpr int STALLED = 100;           // evaluations without a reduction after which a solve ends unconverged
-constexpr double REDUCTION = 0.9;      // of the merit, that counts
 constexpr double SLOWEST = 20.0;       // largest error amplification by slow convergence
 constexpr double LEAST = 0.01;         // lower bound of an error, as a fraction of the last change
 constexpr double REMEMBERED = 0.5;     // fraction of the slowness that is kept at an evaluation
 constexpr double ROUNDING = 8.0 * (sizeof(Real) == 4 ? 1.2e-7 : 2.2e-16); // residual at rounding level
 
-// Sums over the moments of a chunk or a world: ‖M − f(H)‖², ‖f(H)‖², ‖φr‖², ‖φ(2 − ω₁)r‖², ‖φΔs‖² of the last
-// change and of the one before, ⟨φΔg, φΔg'⟩, ‖φΔg'‖², and the products of anderson.h.
-enum Column { DEVIATION, GOAL, MERIT, LEFT, CHANGE, FORMER, FOLLOWED, EARLIER, PRODUCTS };
+// Sums over the moments of a chunk or a world: ‖M − f(H)‖², ‖f(H)‖², ‖φr‖², ‖φ(2 − ω₁)r‖², ‖φΔs‖² of the last change,
+// ⟨φΔg, φΔg'⟩, ‖φΔg'‖², and the products of anderson.h.
+enum Column { DEVIATION, GOAL, MERIT, LEFT, CHANGE, FOLLOWED, EARLIER, PRODUCTS };
 constexpr int COLUMNS = PRODUCTS + DEPTH + DEPTH * (DEPTH + 1) / 2; // as in solve_state.py
 
 // Convergent step length ω = κ/k of a moment with stiffness k (2/3 + o_i), in scalars S.
@@ -50,8 +48,6 @@ CUDA_CALLABLE inline void update_estimates(World& world, const History& history,
     if (world.has_change) {
         const double change = sums[PRODUCTS + matrix_column(0, 0)];
         world.gain[history.newest] = change > 0.0 ? wp::sqrt(sums[CHANGE] / change) : 0.0;
-        const double former = history.count > 1 ? sums[PRODUCTS + matrix_column(1, 1)] : 0.0;
-        if (former > 0.0) world.gain[slot_of(history.newest, 1)] = wp::sqrt(sums[FORMER] / former);
     }
     if (world.best < 0.0) return;
     const double reduction = 1.0 - merit / world.best;
@@ -83,18 +79,6 @@ CUDA_CALLABLE inline bool mix(World& world, const History& history, const double
     return true;
 }
 
-// Counts the evaluations since the merit was reduced. Returns true if the solve ends: where the operator is not
-// positive, as for a thin sheet in a plate of large cells, steps lead nowhere.
-template <class World> CUDA_CALLABLE inline bool stalls(World& world, double merit) {
-    if (world.best < 0.0 || merit < REDUCTION * world.reduced) {
-        world.reduced = merit;
-        world.stalled = 0;
-    } else {
-        world.stalled += 1;
-    }
-    return world.stalled >= STALLED;
-}
-
 // Error after the last step over the residual before it, by the estimate of theta_flow.py.
 template <class World>
 CUDA_CALLABLE inline double amplification(const World& world, const double* sums, double merit, bool mixed) {
@@ -107,8 +91,7 @@ CUDA_CALLABLE inline double amplification(const World& world, const double* sums
         gain = slot_gain > gain ? slot_gain : gain;
     }
     const double all = merit * merit, fraction = removed > 0.0 ? removed < all ? removed / all : 1.0 : 0.0;
-    const double step = merit > 0.0 ? wp::sqrt(sums[LEFT]) / merit : 1.0; // λ
-    const double size = (step > gain ? step : gain) * wp::sqrt(1.0 - fraction) + gain * wp::sqrt(fraction);
+    const double size = merit > 0.0 ? wp::sqrt(sums[LEFT] * (1.0 - fraction)) / merit + gain * wp::sqrt(fraction) : 1.0;
     const double slow = world.slowness > 1.0 ? world.slowness * size : size;
     const double least = merit > 0.0 ? LEAST * wp::sqrt(sums[CHANGE]) / merit : 0.0;
     const double error = slow > least ? slow : least;
@@ -120,7 +103,7 @@ template <class State> CUDA_CALLABLE inline void choose_step(State& state, int w
     auto& world = state.worlds.data[w];
     const History history = history_of(world);
     const double merit = wp::sqrt(sums[MERIT]), residual = relative_residual(sums[DEVIATION], sums[GOAL]);
-    const bool finite = wp::isfinite(merit), failed = (world.best < 0.0 && !finite) || stalls(world, merit);
+    const bool finite = wp::isfinite(merit), failed = world.best < 0.0 && !finite;
     const bool no_field = world.evaluations == 0 && !world.in_field;
     update_estimates(world, history, sums, merit);
     const bool mixed = mix(world, history, sums, merit, finite);
@@ -130,7 +113,6 @@ template <class State> CUDA_CALLABLE inline void choose_step(State& state, int w
         const double followed = sums[EARLIER] > 0.0 ? sums[FOLLOWED] / sums[EARLIER] : 0.0;
         world.ahead = followed < 0.0 ? 0.0 : followed > 1.0 ? 1.0 : followed;
     }
-    world.changed = world.has_change;
     int next = done || world.plain_steps > 0 ? STEP : STEP_AND_SWEEP;
     if (!mixed) next = STEP_FROM_BEST;
     if (done && !finite) next = NOTHING;

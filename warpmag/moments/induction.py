@@ -199,8 +199,7 @@ def solve_induction(
         method: Summation of fields: ``direct``, over all pairs; ``fmm``, the fast multipole method with errors that
             ``rtol`` allows; ``auto``, the faster of the two.
         rtol: Relative error of the magnetizations at which the solve ends.
-        max_evaluations: Field evaluations after which the solve ends unconverged. It ends before if 100 of them do not
-            reduce the residual by a tenth.
+        max_evaluations: Field evaluations after which the solve ends unconverged.
         initial: Magnetizations to start from [A/m], shape [n, 3].
         dtype: ``float32`` or ``float64``.
         device: Warp device; None means the device of the arrays, or Warp's default.

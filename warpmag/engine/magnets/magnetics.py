@@ -117,8 +117,7 @@ class Magnetics:
             rtol: Relative magnetization error at which the induction solve ends.
             external_field: Uniform applied field H0 [A/m], world frame. By default the option ``magnetic`` of an
                 imported MJCF, B/μ0, with a warning; else none.
-            max_evaluations: Field evaluations after which an unconverged induction solve ends. It ends before if 100
-                evaluations do not reduce the residual by a tenth.
+            max_evaluations: Field evaluations after which an unconverged induction solve ends.
             curve: Magnetization curve of all magnets, see :func:`warpmag.add_inducible`; by default each magnet's own.
             dt: Longest time between calls of :meth:`apply` [s]. Drag by eddy currents is limited so that it stops no
                 body within this time.

@@ -125,8 +125,7 @@ class Simulation:
                 in line with the field attract too weakly: by 34 % at a gap of 0.3 radii, by 93 % at 0.01.
             method: Summation method: ``direct``, ``fmm`` or ``auto``, see :class:`warpmag.Magnetics`.
             rtol: Relative magnetization error at which the induction solve ends; by default the stage's, else 1e-3.
-            max_evaluations: Field evaluations after which an unconverged induction solve ends, see
-                :class:`warpmag.Magnetics`.
+            max_evaluations: Field evaluations after which an unconverged induction solve ends.
             external_field: Uniform applied field H0 [A/m]; by default the stage's, else that of an imported MJCF (see
                 :class:`warpmag.Magnetics`), else none.
             curve: Magnetization curve of all magnets, one of ``magnets.CURVES``; by default each magnet's own.
