@@ -15,7 +15,7 @@ from warpmag.kernels.shared.pieces import cut
 from warpmag.kernels.shared.reductions import block_max, block_sum, fence
 
 DEPTH = 5  # changes between iterates that are stored and mixed (``anderson.h``)
-COLUMNS = 7 + DEPTH + DEPTH * (DEPTH + 1) // 2  # sums over the moments of a chunk or world; as in ``theta_step.h``
+COLUMNS = 8 + DEPTH + DEPTH * (DEPTH + 1) // 2  # sums over the moments of a chunk or world; as in ``theta_step.h``
 BLOCK_CHUNK = 128  # moments in a chunk on a GPU, one per thread of a block; on a CPU a chunk has ``native.CHUNK``
 _CHUNK_SIZES = 4, 32, BLOCK_CHUNK
 """Sizes for which the blocks of a GPU are made. Blocks for whole chunks would be mostly idle in small worlds."""
@@ -30,6 +30,7 @@ class World:
     in_field: int  # 1 if there is an applied field, 0 after the first evaluation
     next: int  # its next action, of ``Next`` in ``solve_state.h``
     has_change: int  # 1 if the change from the last iterate to the next one is stored
+    changes_mixture: int  # 1 if the newest change becomes that from mixture to mixture
     change_count: int  # number of stored changes in ``history``
     newest: int  # slot of the newest stored change
     used: int  # number of changes that the next step mixes
@@ -77,8 +78,8 @@ def state_type(dtype):
         h0: wp.array[vec3]  # applied field [A/m], external and of permanent magnets, shape [n]
         h: wp.array[vec3]  # total field [A/m], shape [n]
         s: wp.array[vec3]  # dual variable [dimensionless], shape [n]
-        iterate_s: wp.array[vec3]  # last iterate, shape [n]
-        iterate_r: wp.array[vec3]  # its residual
+        mixed_s: wp.array[vec3]  # last mixture of iterates, shape [n]
+        mixed_r: wp.array[vec3]  # its residual
         history_s: wp.array2d[vec3]  # last changes of both from one evaluation to the next, shape [DEPTH, n]
         history_r: wp.array2d[vec3]
         best_s: wp.array[vec3]  # iterate of the smallest merit, shape [n]
@@ -136,7 +137,7 @@ def allocate(worlds, inducible, dtype, device):
         "converged": put(np.ones(world_count), wp.int32),  # worlds without inducible moments count as converged
         **zeros("near", (count if on_cpu else 0, CAPACITY, CHUNK)),
         **zeros("near_count", count * vectors),
-        **zeros("h0 h s iterate_s iterate_r best_s best_r mixed_g mixed_moment", n, vec3),
+        **zeros("h0 h s mixed_s mixed_r best_s best_r mixed_g mixed_moment", n, vec3),
         **zeros("history_s history_r", (DEPTH, n), vec3),
         **zeros("past_field past_g", (2, n), vec3),
         **zeros("past now swept", (count * size if on_cpu else len(rows), LINE), dtype),
@@ -158,7 +159,7 @@ def allocate(worlds, inducible, dtype, device):
 
 def persistent_arrays(state) -> dict:
     """Return the arrays of a state that persist from one solve to the next, by name."""
-    names = "near near_count s iterate_s iterate_r history_s history_r best_s best_r mixed_g mixed_moment past_field"
+    names = "near near_count s mixed_s mixed_r history_s history_r best_s best_r mixed_g mixed_moment past_field"
     names += " past_g past now swept worlds resting warm residual error evaluations converged"
     return {name: getattr(state, name) for name in names.split()}
 

@@ -256,12 +256,12 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     const Vector r = g - s;
     Vector step = {0, 0, 0};
     if (world.has_change) {
-        step = s - get(state.iterate_s, at);
+        step = s - get(state.mixed_s, at);
         set(state.history_s, at, step, history.newest);
-        set(state.history_r, at, r - get(state.iterate_r, at), history.newest);
+        set(state.history_r, at, r - get(state.mixed_r, at), history.newest);
     }
-    set(state.iterate_s, at, s);
-    set(state.iterate_r, at, r);
+    set(state.mixed_s, at, s);
+    set(state.mixed_r, at, r);
     const Number length_s = length(s), length_g = length(g);
     // M(s) = ratio_s s
     const Number ratio_s = material.saturation * curve_ratio(length_s, material.curves);
@@ -277,6 +277,8 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     put(MERIT, merit * merit);
     put(LEFT, left * left);
     put(CHANGE, square * wide_dot(step, step));
+    const Vector former = history.count > 1 ? get(state.history_s, at, slot_of(history.newest, 1)) : step;
+    put(FORMER, square * wide_dot(former, former));
     const Vector past = get(state.past_g, at), earlier = past - get(state.past_g, at, 1);
     put(FOLLOWED, square * wide_dot(g - past, earlier));
     put(EARLIER, square * wide_dot(earlier, earlier));
@@ -308,7 +310,19 @@ CUDA_CALLABLE inline void keep_solution(State& state, const Span& at, Material m
     set(state.past_g, at, g);
 }
 
-// Takes the world's chosen step: s̄ = s − Σ α_j Δs_j, r̄ = r − Σ α_j Δr_j, s ← s̄ + ω r̄.
+// Stores a mixture of iterates and its residual, and the change to it from the last mixture where they are distinct.
+template <class State> CUDA_CALLABLE inline void keep_mixture(State& state, const Span& at, Vector mixed, Vector r) {
+    const auto& world = state.worlds.data[at.world];
+    if (!world.changes_mixture) return;
+    const int newest = world.newest;
+    set(state.history_s, at, get(state.history_s, at, newest) + (mixed - get(state.mixed_s, at)), newest);
+    set(state.history_r, at, get(state.history_r, at, newest) + (r - get(state.mixed_r, at)), newest);
+    set(state.mixed_s, at, mixed);
+    set(state.mixed_r, at, r);
+}
+
+// Takes the world's chosen step: s̄ = s − Σ α_j Δs_j, r̄ = r − Σ α_j Δr_j, s ← s̄ + ω r̄. The newest change becomes that
+// from mixture to mixture.
 template <class State> CUDA_CALLABLE inline void advance(State& state, const Span& at) {
     const auto& world = state.worlds.data[at.world];
     if (world.next == NOTHING) return;
@@ -317,8 +331,8 @@ template <class State> CUDA_CALLABLE inline void advance(State& state, const Spa
         mixed = get(state.best_s, at);
         r = get(state.best_r, at);
     } else if (world.next != DEMAGNETIZE) {
-        mixed = get(state.iterate_s, at);
-        r = get(state.iterate_r, at);
+        mixed = get(state.mixed_s, at);
+        r = get(state.mixed_r, at);
         if (world.is_best) {
             set(state.best_s, at, mixed);
             set(state.best_r, at, r);
@@ -329,6 +343,7 @@ template <class State> CUDA_CALLABLE inline void advance(State& state, const Spa
             mixed -= alpha * get(state.history_s, at, slot);
             r -= alpha * get(state.history_r, at, slot);
         }
+        keep_mixture(state, at, mixed, r);
     }
     const Number omega = step_of(state, at), whole = whole_step<Real>(omega);
     const Vector g = mixed + r, next = mixed + omega * r;

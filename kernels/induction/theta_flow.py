@@ -3,7 +3,7 @@
 With M1 and M2 symmetric about H_eff, ‖M‖ = Ms cos θ, and ln cot(θ/2) = artanh(‖M‖/Ms) grows linearly in time. The
 unknown is therefore the dual variable s = k f⁻¹(M)/Ms of every inducible moment, with M = Ms c(‖s‖) ŝ. The exact flow
 over a step is s ← (1 − ω) s + ω k H/Ms, ω = κ/k, κ = βΔtMs. One field evaluation gives the target g = k H(M)/Ms and the
-residual r = g − s. With the last few changes Δs_j, Δr_j from one evaluation to the next, Anderson's step is
+residual r = g − s. With the last few changes Δs_j, Δr_j, Anderson's step is
 
     s̄ = s − Σ_j α_j Δs_j,   r̄ = r − Σ_j α_j Δr_j,   s ← s̄ + ω r̄,    α = argmin ‖φ r̄‖.
 
@@ -13,6 +13,12 @@ the ball-averaged kernel. Let L_i = 1 + k (2/3 + o_i), with o_i the volume that 
 (``total_overlap`` in ``theta_flow.h``). The energy decreases from any state for ω_i ≤ 1/L_i, and near the solution the
 steps converge for ω_i < 2/L_i. Steps are short only where balls overlap. Cells of bodies that take steps as a whole
 (``body_steps.py``) count o_i twice, because of the demagnetizing factor of overlaps.
+
+Once a solve has taken as many evaluations as changes are stored, the newest change, from the last mixture to this
+iterate, becomes that from the last mixture to s̄, if the iterate is the best so far. The coupling is symmetric, so that
+few such changes are as good as all (conjugate residuals; short-term recurrence of Wei, Bao and Liu 2022). Heaps of
+plates and bars take 26 evaluations in place of 35, and sheets on each other less than half. Mixtures are not evaluated:
+where the iterates do not improve, the changes between them are more precise.
 
 A step changes the field most at near neighbors. Sweeps update the neighbors' part without another evaluation of the
 whole field. With the coupling G' of the listed neighbors, two sweeps s ← s + ω' (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s)
@@ -27,7 +33,9 @@ whole step ω₁ is 1, which solves an isolated ball, or less where balls overla
 changes s by at most γ times that part, γ = max ‖φ Δs_j‖/‖φ Δr_j‖. The step corrects the rest, r̄, and the estimate
 allows the same error again. So the estimate amplifies the residual (Eq. 12) of the last iterate,
 
-    error = ‖M − f(H)‖/‖f(H)‖ · max(1, σ [λ ‖φ r̄‖ + γ √(‖φ r‖² − ‖φ r̄‖²)]/‖φ r‖),   λ = ‖φ (2 − ω₁) r‖/‖φ r‖.
+    error = ‖M − f(H)‖/‖f(H)‖ · max(1, σ [λ ‖φ r̄‖ + γ √(‖φ r‖² − ‖φ r̄‖²)]/‖φ r‖),
+
+with λ = ‖φ (2 − ω₁) r‖/‖φ r‖. The mixtures of long solves leave slow modes in r̄, so that λ is at least γ there.
 
 With slow convergence many steps like the last one remain. The factor σ is their geometric series ρ/(1 − ρ), and at
 least 1, with ρ the ratio of ‖φ r‖ to its smallest earlier value. At least half of σ is kept at the next evaluation. The

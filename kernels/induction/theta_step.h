@@ -13,9 +13,9 @@ constexpr double LEAST = 0.01;         // lower bound of an error, as a fraction
 constexpr double REMEMBERED = 0.5;     // fraction of the slowness that is kept at an evaluation
 constexpr double ROUNDING = 8.0 * (sizeof(Real) == 4 ? 1.2e-7 : 2.2e-16); // residual at rounding level
 
-// Sums over the moments of a chunk or a world: ‖M − f(H)‖², ‖f(H)‖², ‖φr‖², ‖φ(2 − ω₁)r‖², ‖φΔs‖² of the last change,
-// ⟨φΔg, φΔg'⟩, ‖φΔg'‖², and the products of anderson.h.
-enum Column { DEVIATION, GOAL, MERIT, LEFT, CHANGE, FOLLOWED, EARLIER, PRODUCTS };
+// Sums over the moments of a chunk or a world: ‖M − f(H)‖², ‖f(H)‖², ‖φr‖², ‖φ(2 − ω₁)r‖², ‖φΔs‖² of the last
+// change and of the one before, ⟨φΔg, φΔg'⟩, ‖φΔg'‖², and the products of anderson.h.
+enum Column { DEVIATION, GOAL, MERIT, LEFT, CHANGE, FORMER, FOLLOWED, EARLIER, PRODUCTS };
 constexpr int COLUMNS = PRODUCTS + DEPTH + DEPTH * (DEPTH + 1) / 2; // as in solve_state.py
 
 // Convergent step length ω = κ/k of a moment with stiffness k (2/3 + o_i), in scalars S.
@@ -48,6 +48,8 @@ CUDA_CALLABLE inline void update_estimates(World& world, const History& history,
     if (world.has_change) {
         const double change = sums[PRODUCTS + matrix_column(0, 0)];
         world.gain[history.newest] = change > 0.0 ? wp::sqrt(sums[CHANGE] / change) : 0.0;
+        const double former = history.count > 1 ? sums[PRODUCTS + matrix_column(1, 1)] : 0.0;
+        if (former > 0.0) world.gain[slot_of(history.newest, 1)] = wp::sqrt(sums[FORMER] / former);
     }
     if (world.best < 0.0) return;
     const double reduction = 1.0 - merit / world.best;
@@ -79,6 +81,9 @@ CUDA_CALLABLE inline bool mix(World& world, const History& history, const double
     return true;
 }
 
+// Whether a solve is long: then few stored changes must tell about all earlier ones, so they are those of mixtures.
+template <class World> CUDA_CALLABLE inline bool is_long(const World& world) { return world.evaluations >= DEPTH; }
+
 // Error after the last step over the residual before it, by the estimate of theta_flow.py.
 template <class World>
 CUDA_CALLABLE inline double amplification(const World& world, const double* sums, double merit, bool mixed) {
@@ -91,7 +96,9 @@ CUDA_CALLABLE inline double amplification(const World& world, const double* sums
         gain = slot_gain > gain ? slot_gain : gain;
     }
     const double all = merit * merit, fraction = removed > 0.0 ? removed < all ? removed / all : 1.0 : 0.0;
-    const double size = merit > 0.0 ? wp::sqrt(sums[LEFT] * (1.0 - fraction)) / merit + gain * wp::sqrt(fraction) : 1.0;
+    const double step = merit > 0.0 ? wp::sqrt(sums[LEFT]) / merit : 1.0; // λ
+    const double left = is_long(world) && gain > step ? gain : step;
+    const double size = left * wp::sqrt(1.0 - fraction) + gain * wp::sqrt(fraction);
     const double slow = world.slowness > 1.0 ? world.slowness * size : size;
     const double least = merit > 0.0 ? LEAST * wp::sqrt(sums[CHANGE]) / merit : 0.0;
     const double error = slow > least ? slow : least;
@@ -113,6 +120,7 @@ template <class State> CUDA_CALLABLE inline void choose_step(State& state, int w
         const double followed = sums[EARLIER] > 0.0 ? sums[FOLLOWED] / sums[EARLIER] : 0.0;
         world.ahead = followed < 0.0 ? 0.0 : followed > 1.0 ? 1.0 : followed;
     }
+    world.changes_mixture = world.has_change && world.is_best && is_long(world);
     int next = done || world.plain_steps > 0 ? STEP : STEP_AND_SWEEP;
     if (!mixed) next = STEP_FROM_BEST;
     if (done && !finite) next = NOTHING;
