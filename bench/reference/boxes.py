@@ -5,10 +5,20 @@ The windows are those of ``warpmag.kernels.cells.cell_pairs``; all formulas are 
 
 import itertools
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from bench.reference import oracle
+
+
+class Windows(NamedTuple):
+    """Distances at which pairs change, in means of their sizes: values of ``warpmag.kernels.cells.cell_pairs``."""
+
+    all: tuple[float, float]  # of all boxes
+    close: tuple[float, float]  # of boxes that are integrated over
+    fine: tuple[float, float]  # of flat boxes that have fine points
+    flat: float  # ratio of the two shortest sides of flat boxes
 
 
 def field_tensor(r: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -31,13 +41,16 @@ def field_tensor(r: np.ndarray, half: np.ndarray) -> np.ndarray:
     return tensor / (4.0 * np.pi)
 
 
-def mean_tensor(r, rotation, half, other_half) -> np.ndarray:
-    """Field tensor of a box over its volume, averaged over 2³ Gauss points of another one [1/m³], shape [3, 3].
+def mean_tensor(r, rotation, half, other_half, *, fine: bool = False) -> np.ndarray:
+    """Field tensor of a box over its volume, averaged over Gauss points of another one [1/m³], shape [3, 3].
 
-    ``r`` is the position of the other box and ``rotation`` its rotation, both in the frame of the box.
+    There are two points along each axis; ``fine`` means two in each half of the longer axes. ``r`` is the position of
+    the other box and ``rotation`` its rotation, both in the frame of the box.
     """
     nodes, _ = np.polynomial.legendre.leggauss(2)
-    places = np.array(list(itertools.product(nodes, repeat=3))) * other_half
+    along = [np.append(nodes - 1.0, nodes + 1.0) / 2.0 if fine else nodes] * 3
+    along[np.argmin(other_half)] = nodes
+    places = np.array(list(itertools.product(*along))) * other_half
     return field_tensor(r + places @ rotation.T, half).mean(axis=0) / (8.0 * np.prod(half))
 
 
@@ -58,31 +71,42 @@ def fade(distance: float, window: tuple[float, float]) -> float:
     return float(t * t * (3.0 - 2.0 * t))
 
 
-def pair_correction(a, b, window, close) -> np.ndarray:
+def blended_tensor(source, target, fine: float) -> np.ndarray:
+    """Mean of the tensor over fine points, by the share ``fine``, and over 2³ points [1/m³], shape [3, 3]."""
+    (x, turn, half), (y, other_turn, other_half) = source, target
+    points = turn.T @ (y - x), turn.T @ other_turn, half, other_half
+    return turn @ (fine * mean_tensor(*points, fine=True) + (1.0 - fine) * mean_tensor(*points)) @ turn.T
+
+
+def is_flat(half, ratio: float) -> bool:
+    """Return True if the shortest side of a box is shorter than the next one times ``ratio``."""
+    least, middle, _ = np.sort(half)
+    return bool(least < ratio * middle)
+
+
+def pair_correction(a, b, windows: Windows) -> np.ndarray:
     """Tensor of two boxes less that of balls of their volumes [1/m³], shape [3, 3], for bodies of equal cells.
 
     Args:
         a, b: Boxes: position [m], rotation matrix, half sides [m].
-        window, close: Windows of all boxes and of boxes integrated over, in means of their sizes.
+        windows: Windows of the pairs.
     """
     (x, turn, half), (y, other_turn, other_half) = a, b
     r, d = x - y, np.linalg.norm(x - y)
     sizes = [2.0 * h.max() * np.sqrt(min(h.max() / h.min(), 3.0)) for h in (half, other_half)]
     radii = [np.cbrt(8.0 * h.prod() * 0.75 / np.pi) for h in (half, other_half)]
     distance = d / np.mean(sizes)
-    if distance >= window[1]:
+    if distance >= windows.all[1]:
         return np.zeros((3, 3))
 
-    if half.prod() <= other_half.prod() * 1.0005:
-        of_larger = other_turn @ mean_tensor(other_turn.T @ r, other_turn.T @ turn, other_half, half) @ other_turn.T
-    else:
-        of_larger = turn @ mean_tensor(-turn.T @ r, turn.T @ other_turn, half, other_half) @ turn.T
+    source, target = (b, a) if half.prod() <= other_half.prod() * 1.0005 else (a, b)
+    of_larger = blended_tensor(source, target, is_flat(target[2], windows.flat) * fade(distance, windows.fine))
     spread = turn @ np.diag(half**2 / 3.0) @ turn.T + other_turn @ np.diag(other_half**2 / 3.0) @ other_turn.T
     g1, g2, _ = oracle.radial_factors(np.array([d]), radii[0], radii[1])
     ball = (g1[0] * np.eye(3) + g2[0] * np.outer(r, r)) / (4.0 * np.pi)
-    near = fade(distance, close)
+    near = fade(distance, windows.close)
     tensor = near * (of_larger - ball) + (1.0 - near) * quadrupole_tensor(r, spread)
-    return fade(distance, window) * tensor
+    return fade(distance, windows.all) * tensor
 
 
 def overlap_share(a, b) -> float:
@@ -112,20 +136,20 @@ def overlap_share(a, b) -> float:
     return min(on_normals / on_edges, 1.0) * volume / (8.0 * a[2].prod())
 
 
-def body_corrections(cells, bodies, window, close, overlap_demagnetization: float, overlaps) -> np.ndarray:
+def body_corrections(cells, bodies, windows: Windows, overlap_demagnetization: float, overlaps) -> np.ndarray:
     """Tensors between cells of different bodies [1/m³], shape [n, 3, n, 3]: H_i is the sum of T_ij m_j.
 
     Args:
         cells: Position [m], rotation matrix and half sides [m] of each cell.
         bodies: Body of each cell, shape [n].
-        window, close: As for :func:`pair_correction`.
+        windows: As for :func:`pair_correction`.
         overlap_demagnetization: Demagnetizing factor added to a cell inside another body.
         overlaps: Shares of its volume from which a cell gets some and all of it.
     """
     n, tensors, overlap = len(cells), np.zeros((len(cells), 3, len(cells), 3)), np.zeros(len(cells))
     for i, j in itertools.combinations(range(n), 2):
         if bodies[i] != bodies[j]:
-            tensors[i, :, j] = tensors[j, :, i] = pair_correction(cells[i], cells[j], window, close)
+            tensors[i, :, j] = tensors[j, :, i] = pair_correction(cells[i], cells[j], windows)
             overlap[i] += overlap_share(cells[i], cells[j])
             overlap[j] += overlap_share(cells[j], cells[i])
     volumes = np.array([8.0 * half.prod() for _, _, half in cells])

@@ -1,14 +1,16 @@
 // Tensor and forces of a pair of magnetized boxes, less those of balls of the same volumes, in the frame of box i.
 //
-// The tensor of close boxes is the field of the larger box, averaged over 2³ Gauss points of the smaller one. One of a
-// pair may be a ball: a ball's field is a closed form, too, and the average over a ball is the value at its center.
-// Boxes farther apart differ from balls by their quadrupoles. A window function ends this difference. Forces are the
-// exact derivatives of the energy −μ0 m_i·T_ij·m_j, so that they conserve energy and momentum. Lengths are in units of
-// the mean of the boxes' sizes.
+// The tensor of close boxes is the field of the larger box, averaged over 2³ Gauss points of the smaller one. Beside a
+// flat box the field varies more over its faces, so 4 × 4 × 2 points replace them there. One of a pair may be a ball: a
+// ball's field is a closed form, too, and the average over a ball is the value at its center. Boxes farther apart
+// differ from balls by their quadrupoles. A window function ends this difference. Forces are the exact derivatives of
+// the energy −μ0 m_i·T_ij·m_j, so that they conserve energy and momentum. Lengths are in units of the mean of the
+// boxes' sizes.
 //
-// From Python: WINDOW_BEGIN, WINDOW_END, CLOSE_BEGIN and CLOSE_END, distances of the windows.
+// From Python: WINDOW_BEGIN, WINDOW_END, CLOSE_BEGIN, CLOSE_END, FINE_BEGIN and FINE_END, distances of the windows.
 #pragma once
 #include "cells/box_field.h"
+#include "cells/gauss_points.h"
 #include "cells/thickened.h"
 #include "pairs/pair_law.h"
 
@@ -18,11 +20,11 @@ constexpr Real SMALLER = Real(0.999); // ratio of volumes from which a box count
 
 // Boxes of cells: center, half sides, rotation to the world as quaternion, volume, the size that scales the window, and
 // the radius of the ball of the same volume. Balls have half sides for the windows only. ``linear`` boxes have
-// differences.
+// differences; ``flat`` ones are of bodies of flat cells.
 struct Boxes {
     Vector center, half;
     Number q[4], volume, size, radius;
-    Mask ball, linear, inducible;
+    Mask ball, linear, flat, inducible;
 };
 
 // Pose of box j relative to box i: separation, and rotation from the frame of j to that of i.
@@ -48,14 +50,14 @@ CUDA_CALLABLE inline Window window_between(Number d, Real begin, Real end, Mask 
 }
 
 // A pair of boxes in units of ``1/unit``: half sides, separation r from i to j, rotation of j in the frame of i, radii
-// of the balls, the window of all boxes, and that of close boxes. ``own_points``: the Gauss points are those of i.
-// ``of_ball``: the other one of the pair, the source, is a ball; ``at_ball``: the one with the points is. ``linear``:
-// one of the two has differences.
+// of the balls, the window of all boxes, that of close boxes, and that of 4 × 4 × 2 points. ``own_points``: the Gauss
+// points are those of i. ``of_ball``: the other one of the pair, the source, is a ball; ``at_ball``: the one with the
+// points is. ``linear``: one of the two has differences.
 struct BoxPair {
     Vector half, other_half, r;
     Rotation<Number> rotation;
     Number unit, radius, other_radius;
-    Window window, close;
+    Window window, close, fine;
     Mask own_points, of_ball, at_ball, linear;
 };
 CUDA_CALLABLE inline Number longest(Vector half) { return larger(half.x, larger(half.y, half.z)); }
@@ -67,6 +69,7 @@ CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, cons
     Window close = window_between(d, CLOSE_BEGIN, CLOSE_END, listed);
     const Mask own_smaller = own.volume < SMALLER * other.volume, alike = own.volume * SMALLER <= other.volume;
     const Mask own_points = own_smaller | (own_first & alike);
+    const Mask flat = own_points ? own.flat : other.flat;
     return {unit * own.half,
             unit * other.half,
             r,
@@ -76,29 +79,11 @@ CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, cons
             unit * other.radius,
             window_between(d, WINDOW_BEGIN, WINDOW_END, listed),
             close,
+            window_between(d, FINE_BEGIN, FINE_END, listed & flat),
             own_points,
             own_points ? other.ball : own.ball,
             own_points ? own.ball : other.ball,
             own.linear | other.linear};
-}
-
-// Range of the 2³ Gauss points of a box, shares of whose sums are evaluated. Shares that belong to no point are part of
-// the first one's.
-struct Points {
-    int first, count;
-};
-constexpr int POINTS = 8;
-constexpr Points ALL_POINTS = {0, POINTS};
-
-// Calls visit(p, signs) for Gauss points of a box of half sides h, which have equal weights. The signs tell the half
-// along each axis, times a factor: the points are farther apart than the centers of the halves. So half the difference
-// of a linear field between the halves is exact.
-template <class Visit> CUDA_CALLABLE inline void for_gauss_points(Vector h, Points points, Visit visit) {
-    constexpr Real SIGN = Real(0.5) / GAUSS_PLACE, STEP = GAUSS_PLACE / SIGN;
-    for (int k = points.first; k < points.first + points.count; ++k) {
-        const Real signs[3] = {k & 1 ? SIGN : -SIGN, k & 2 ? SIGN : -SIGN, k & 4 ? SIGN : -SIGN};
-        visit(Vector{STEP * signs[0] * h.x, STEP * signs[1] * h.y, STEP * signs[2] * h.z}, signs);
-    }
 }
 
 // Upper half of a box along an axis, seen from a point of the frame of the box.
@@ -225,12 +210,13 @@ CUDA_CALLABLE inline PairMatrices boxes_matrices(const BoxPair& p, Points points
     Symmetric total = {zero, zero, zero, zero, zero, zero};
     PairMatrices sums; // rows in the frame of the target, columns in that of the source
     for (int k = 0; k < 9; ++k) sums.of_differences[k] = sums.at_differences[k] = sums.differences[k] = zero;
-    for_gauss_points(s.target_half, points, [&](Vector x, const Real* signs) {
-        const Vector at = s.center + to_world(s.rotation, x);
-        const Symmetric full = s.tensor(at);
+    for_gauss_points(s.target_half, p.fine.value, points, [&](const GaussPoint& point) {
+        const Vector at = s.center + to_world(s.rotation, point.at);
+        const Number signs[3] = {point.signs.x, point.signs.y, point.signs.z};
+        const Symmetric full = point.weight * s.tensor(at);
         total = total + full;
         for (int l = 0; l < 3 && linear; ++l) {
-            const Vector of_both = column(full, l), of_upper = column(s.upper_half_tensor(at, l), l);
+            const Vector of_both = column(full, l), of_upper = point.weight * column(s.upper_half_tensor(at, l), l);
             const Vector mean = to_body(s.rotation, of_both), difference = to_body(s.rotation, 2 * of_upper - of_both);
             const Number by_mean[3] = {mean.x, mean.y, mean.z},
                          by_difference[3] = {difference.x, difference.y, difference.z};
@@ -365,15 +351,17 @@ CUDA_CALLABLE inline Wrench boxes_wrench(const BoxPair& p, const PairMoments& mo
     const Vector at_target = s.choose(own, moments.own_difference, moments.other_difference);
     const Vector at_source = s.choose(own, moments.other_difference, moments.own_difference);
     Vector force = {zero, zero, zero}, torque = force; // on the target, about the center of the source
-    Number work = zero;
-    for_gauss_points(s.target_half, points, [&](Vector x, const Real* signs) {
-        const Vector at = s.center + to_world(s.rotation, x);
-        const Vector difference = {signs[0] * at_target.x, signs[1] * at_target.y, signs[2] * at_target.z};
+    Number work = zero, change = zero;                 // and the change of the work with the window of fine points
+    for_gauss_points(s.target_half, p.fine.value, points, [&](const GaussPoint& point) {
+        const Vector at = s.center + to_world(s.rotation, point.at), signs = point.signs;
+        const Vector difference = {signs.x * at_target.x, signs.y * at_target.y, signs.z * at_target.z};
         const Vector here = of_target + to_world(s.rotation, difference);
         auto add = [&](Vector push, Vector field) {
-            force += push;
-            torque += cross(at, push) + cross(here, field);
-            work += dot(here, field);
+            const Number of_point = dot(here, field);
+            force += point.weight * push;
+            torque += point.weight * (cross(at, push) + cross(here, field));
+            work += point.weight * of_point;
+            change += point.slope * of_point;
         };
         auto add_half = [&](int axis, Vector source) {
             const BoxView view = view_upper_half(at, s.half, axis);
@@ -387,8 +375,10 @@ CUDA_CALLABLE inline Wrench boxes_wrench(const BoxPair& p, const PairMoments& mo
         add_half(2, {zero, zero, 2 * at_source.z});
     });
     const Vector about_target = torque - cross(s.center, force);
-    const Vector on_i = s.choose(own, force, -force), turning = s.choose(own, about_target, -torque);
-    return {s.scale * s.from_source(p, on_i), s.scale * s.from_source(p, turning), s.scale * work};
+    const Vector inward = -1 / larger(length(p.r), zero + Real(1e-12)) * p.r;
+    const Vector radial = p.fine.slope * change * inward, on_i = s.choose(own, force, -force),
+                 turning = s.choose(own, about_target, -torque);
+    return {s.scale * (s.from_source(p, on_i) + radial), s.scale * s.from_source(p, turning), s.scale * work};
 }
 
 // Wrench of m·T e, for T of ``quadrupole_tensor``. The torque has a share of the quadrupole of i, which turns with it.

@@ -39,7 +39,7 @@ template <class Pairs> CUDA_CALLABLE inline void locate(const Pairs& a, int i) {
     for (int k = 0; k < 4; ++k) line[k] = row[k * pitch], line[4 + k] = half[k * cells], turn[k] = k == 3;
     if (!is_ball) put_product(a.rotation.data[body], a.grid.data[body], turn);
     line[12] = is_ball ? BALL * line[3] * line[3] * line[3] : 8 * line[4] * line[5] * line[6];
-    line[13] = is_ball, line[14] = a.linear.data[body], line[15] = a.inducible.data[i];
+    line[13] = is_ball, line[14] = a.linear.data[body] + 2 * a.flat.data[body], line[15] = a.inducible.data[i];
     const Real* const listed = (const Real*)a.found_at.data + 3 * (size_t)i;
     const Real x = line[0] - listed[0], y = line[1] - listed[1], z = line[2] - listed[2];
     const Real limit = MARGIN / 2 * line[7];
@@ -177,7 +177,8 @@ template <class Pairs> struct Rows {
                 sides.w,
                 place.w,
                 kind.y > Real(0),
-                kind.z > Real(0),
+                (kind.z == Real(1)) | (kind.z == Real(3)),
+                kind.z >= Real(2),
                 kind.w > Real(0)};
     }
     // Where a candidate is another cell.

@@ -32,6 +32,11 @@ a surface cuts off, of little volume."""
 CLOSE = 1.75, 2.25
 """Distances at which the average over close boxes turns into their quadrupoles, in means of their sizes, too. In means
 of their longest sides the operator of a stack of five sheets would have an eigenvalue of -0.0025."""
+FINE = 0.8, 1.1
+"""Distances at which 4 × 4 × 2 points of a flat box turn into 2³, in means of sizes. Touching flat boxes are at 0.2 to
+0.8. The demagnetizing factor between boxes twice as wide as high is 7 % too large with 2³ points."""
+FLAT = 0.57
+"""Ratio of the shortest side to the next one below which whole cells of a body are flat."""
 OVERLAP_DEMAGNETIZATION = 0.45
 """Demagnetizing factor added to a cell inside another body. Quadrature over intersecting boxes leaves eigenvalues of
 -0.13."""
@@ -77,6 +82,7 @@ def cell_pairs_type(dtype):
         half: wp.array2d[dtype]  # half sides of the boxes in the frame of the body's grid, and sizes [m], shape [4, n]
         grid: wp.array[quaternion]  # from the frame of each body's grid to that of the body, shape [b]
         linear: wp.array[int]  # 1 for bodies of linear cells, 0 for balls, shape [b + 1]
+        flat: wp.array[int]  # 1 for bodies of flat cells, 0 for balls, shape [b + 1]
         inducible: wp.array[int]  # 1 for inducible moments, shape [n]
         movable: wp.array[int]  # 1 where the force is evaluated, shape [n]
         rotatable: wp.array[int]  # 1 where the torque is evaluated, too, shape [n]
@@ -122,6 +128,8 @@ def pair_constants() -> dict[str, float]:
         OVERLAP_END=OVERLAP[1],
         CLOSE_BEGIN=CLOSE[0],
         CLOSE_END=CLOSE[1],
+        FINE_BEGIN=FINE[0],
+        FINE_END=FINE[1],
         WINDOW_BEGIN=WINDOW[0],
         WINDOW_END=WINDOW[1],
         MARGIN=_MARGIN,
@@ -140,6 +148,12 @@ def _volume_factors(half_sides) -> np.ndarray:
     """Return (V/V_max)^⅕ for half sides of the boxes of a body, shape [3, cells]: quadrupole fields fall as V/r⁵."""
     volumes = half_sides.prod(axis=0)
     return (volumes / volumes.max()) ** 0.2
+
+
+def _has_flat_cells(half_sides) -> bool:
+    """Return True if whole cells of a body are flat; ``half_sides`` have the shape [cells, 3]."""
+    least, middle, _ = np.sort(half_sides[half_sides.prod(axis=1).argmax()])
+    return bool(least < FLAT * middle)
 
 
 def _balls_among_cells(balls, radii, worlds, group, half) -> np.ndarray:
@@ -243,6 +257,7 @@ class CellPairs:
         quaternion = wp.types.quaternion(dtype)
         a.group, a.body, a.half, a.movable = put(group), put(body), put(half, dtype), put(layout.movable)
         a.rotatable, a.inducible = rotatable, put(~layout.permanent)
+        a.flat = put([*(_has_flat_cells(coupling.half_sides) for _, coupling in bodies), False])
         a.linear = put([*(coupling.slopes is not None for _, coupling in bodies), False])
         a.grid, a.rotation = put([coupling.grid_rotation for _, coupling in bodies], quaternion), cells.rotations
         a.packed, a.h, a.forces, a.torques = packed.packed, h, forces, torques

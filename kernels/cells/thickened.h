@@ -1,10 +1,10 @@
 // Boxes that are thickened where others intersect them, as sources of fields that Gauss points average.
 #pragma once
+#include "cells/gauss_points.h"
 #include "cells/rotation.h"
 
 namespace warpmag {
 
-constexpr Real GAUSS_PLACE = Real(0.5773502691896258);                    // of two points in a box of half sides 1
 constexpr Real THICKENING_BEGIN = Real(0.1), THICKENING_END = Real(0.35); // common parts of intersecting boxes
 
 // Common part of the projections of two boxes on each axis of one of them, half sides ``own``; ``extent`` are half the
