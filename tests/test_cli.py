@@ -106,7 +106,9 @@ def test_an_existing_result_is_not_overwritten(scene, device, tmp_path, capsys):
     out = tmp_path / "out.usda"
     out.write_text("a result")
     command = ["run", str(scene), "-o", str(out), "--frames", "1", "--device", device]
-    check_refused(command, f"{out}: exists; give --overwrite, --resume to continue that run, or another -o", capsys)
+    check_refused(
+        command, f"{out}: exists; add --overwrite to replace it, --resume to continue its run, or another -o", capsys
+    )
     assert out.read_text() == "a result"
     assert cli.main([*command, "--overwrite"]) == 0
     assert Usd.Stage.Open(str(out)).GetEndTimeCode() == pytest.approx(1.0, abs=0.03)  # at the nearest step

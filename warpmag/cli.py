@@ -311,7 +311,9 @@ def _check_run(options) -> None:
 def _check_new(output: Path) -> None:
     """Raise :class:`InputError` if the output exists."""
     if output.exists():
-        raise InputError(f"{output}: exists; give --overwrite, --resume to continue that run, or another -o")
+        raise InputError(
+            f"{output}: exists; add --overwrite to replace it, --resume to continue its run, or another -o"
+        )
 
 
 def _simulation_of(path: Path, options):

@@ -68,7 +68,7 @@ class Magnets:
 
     @property
     def magnetics(self) -> Magnetics:
-        """Magnetics of Isaac Lab's model; before the start of the physics an :class:`InputError`."""
+        """Magnetics of Isaac Lab's model; raises :class:`InputError` before the physics has started."""
         if self._magnetics is None:
             raise InputError("Magnets: the physics has not started, make the environment first")
         return self._magnetics

@@ -179,7 +179,7 @@ class Coil:
         unit="volt", range=f"[-{LARGEST_STRENGTH:g}, {LARGEST_STRENGTH:g}]", check=check_strength,
     )] = 0.0  # fmt: skip
     turns: Annotated[float, Attribute(
-        "coil:turns", "float", "Turns", "Number of turns of a coil with a resistance, which must give it.",
+        "coil:turns", "float", "Turns", "Number of turns; a coil with a resistance requires it.",
         unit="dimensionless", range=_CIRCUIT_TEXT, check=check_circuit_value, uniform=True,
     )] = 0.0  # fmt: skip
     inductance: Annotated[float, Attribute(

@@ -80,7 +80,7 @@ class MagnetizationCurve:
             name: Name of the curve in messages.
 
         Raises:
-            InputError: The points are no magnetization curve; the message names the reason and the point.
+            InputError: The points are not a magnetization curve; the message names the reason and the point.
         """
         h, b = _points(name, fields, "flux densities", flux_densities)
         return cls._from_points(name, h, b / MU0 - h, saturation)
@@ -107,7 +107,7 @@ class MagnetizationCurve:
         kA/m or MA/m for M. Lines that begin with # are skipped.
 
         Raises:
-            InputError: The file cannot be read, or the points are no magnetization curve.
+            InputError: The file cannot be read, or the points are not a magnetization curve.
         """
         if not isinstance(path, str | os.PathLike):
             raise InputError(f"path: must be the name of a file, got {short_repr(path)}")

@@ -34,8 +34,8 @@ class FieldProbe:
         gradients: True to compute gradients, which takes three more sums over pairs.
 
     Raises:
-        InputError: ``worlds`` has a wrong shape, or holds a world that the system lacks. Or an argument has another
-            type than it must have.
+        InputError: ``worlds`` has a wrong shape, or holds a world that the system lacks. Or an argument has a
+            wrong type.
 
     Attributes:
         points: The points [m], shape [p]; written by the caller before :meth:`measure`.

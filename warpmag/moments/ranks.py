@@ -134,7 +134,7 @@ def sweep(simulate: Callable[[range], _R], world_count: int, *, together: int) -
         The result of each group, in the order of worlds; the same on all ranks.
 
     Raises:
-        InputError: ``simulate`` is no function; ``world_count`` or ``together`` is not a whole number from 1 on, or
+        InputError: ``simulate`` is not a function; ``world_count`` or ``together`` is not a whole number from 1 on, or
             differs between ranks. An error of ``simulate`` on one rank is raised on all ranks.
 
     Example:

@@ -27,8 +27,10 @@ _PAUSE = 1.0 / 60.0
 def no_viewer(name: str, error: Exception) -> InputError:
     """Return an error of one line about a viewer that could not open."""
     reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-    display = "a display, without one take viser or rerun, and " if name == "gl" else ""
-    return InputError(f"viewer: {name} cannot open, it needs {display}{extra('viewers')}: {reason}")
+    if isinstance(error, ModuleNotFoundError):
+        return InputError(f"viewer: {name} needs {extra('viewers')}: {reason}")
+    display = ", it needs a display; viser and rerun need none" if name == "gl" else ""
+    return InputError(f"viewer: {name} cannot open{display}: {reason}")
 
 
 class Display:

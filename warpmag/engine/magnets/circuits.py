@@ -110,7 +110,7 @@ class CoilCircuits:
         return [self._arrays.strength, *self._state()]
 
     def reset(self, mask: WorldMask) -> None:
-        """Launch the return of the circuits of chosen worlds to the start, with the strengths of the model."""
+        """Launch a reset of the circuits of chosen worlds to their initial state, with the strengths of the model."""
         for rows in self._rows:
             rows.restore(mask)
 

@@ -54,8 +54,9 @@ def add_inducible(
         susceptibility: Susceptibility χ [dimensionless], infinite by default.
         curve: Magnetization curve: one of ``magnets.CURVES``, ``tanh`` by default, or a measured curve: a
             :class:`warpmag.MagnetizationCurve` or the name of a material with a measured curve. A measured curve
-            replaces saturation and susceptibility. A formula gives M in the field of all others for a ball of one
-            moment, and in the field inside for other shapes. ``tanh-applied`` takes the field of all others for both.
+            replaces saturation and susceptibility. A formula is a function of the field of all other sources for
+            a ball of one moment, and of the field inside for other shapes. ``tanh-applied`` is a function of the field
+            of all other sources for both.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
         conductivity: Electrical conductivity [S/m] of a ball of one moment, its body's only magnet. Eddy currents brake
             a conductor that moves through the field. 0 means no eddy currents. ``material`` does not set it, since eddy
@@ -65,8 +66,8 @@ def add_inducible(
         Indices of the shapes that became magnets.
 
     Raises:
-        InputError: The attributes are not declared, not exactly one of ``body`` and ``shape`` is given, nothing or
-            several objects have the label, the shapes have no volume, or a value is out of range.
+        InputError: The attributes are not declared, not exactly one of ``body`` and ``shape`` is given, no
+            object or several objects match the label, the shapes have no volume, or a value is out of range.
 
     Warns:
         UnitWarning: A ball is so large that its radius is likely in another unit.
@@ -133,7 +134,8 @@ def add_permanent(
 
     Raises:
         InputError: The attributes are not declared, not exactly one of ``body`` and ``shape`` or of the three strengths
-            is given, the label matches no or several objects, the shapes have no volume, or a value is out of range.
+            is given, no object or several objects match the label, the shapes have no volume, or a value is out of
+            range.
 
     Warns:
         UnitWarning: The magnetization is not that of a real magnet, or a ball is so large that its radius is likely in

@@ -270,8 +270,8 @@ class Magnetics:
 
         Raises:
             InputError: ``model.warpmag`` has changed, see :meth:`notify_model_changed`; with a GPU some calls later.
-                Or a ``wp.Tape`` is active, ``body_q`` requires a gradient, and the forces have none. Or ``dt`` is
-                missing or not positive.
+                Or a ``wp.Tape`` is active, ``body_q`` requires a gradient, and the forces have no gradient. Or
+                ``dt`` is missing or not positive.
 
         Warns:
             ConvergenceWarning: ``max_evaluations`` did not reach ``rtol``. With a GPU only methods that return arrays
@@ -300,7 +300,7 @@ class Magnetics:
             sharing: Number of substeps for which the currents advance, at least 2, on the device, int32, shape [1].
 
         Raises:
-            InputError: An argument has another type, size or device than it must have, or ``dt`` is not positive.
+            InputError: An argument has a wrong type, size or device, or ``dt`` is not positive.
         """
         self._solve(state, dt, sharing)
 

@@ -26,7 +26,7 @@ class BodyLoad:
 
 @dataclass(frozen=True)
 class Workload:
-    """Time of a step by part, and by body; ``str`` gives both as a table."""
+    """Time of a step by part, and by body; ``str`` returns both as a table."""
 
     seconds: dict[str, float]  # time of each part [s]
     bodies: tuple[BodyLoad, ...]  # the most expensive first

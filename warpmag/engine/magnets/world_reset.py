@@ -82,7 +82,7 @@ class WorldRows:
         self._array = array  # ``_rows`` is a view of its memory
 
     def restore(self, mask: WorldMask) -> None:
-        """Launch the return of the rows of chosen worlds."""
+        """Launch a reset of the rows of chosen worlds."""
         restore_rows(mask.array, self._worlds, self._saved, self._rows)
 
 
@@ -103,7 +103,7 @@ class WorldStart:
         ]
 
     def restore(self, worlds: Any) -> tuple[WorldMask, wp.array]:
-        """Launch the return of the values of ``worlds``, as of :meth:`WorldMask.set`.
+        """Launch a reset of the values of ``worlds``, as of :meth:`WorldMask.set`.
 
         Returns:
             The mask, and 1 for each of the system's worlds that starts again, else 0, shape [worlds of the system].

@@ -146,11 +146,11 @@ class Statistics:
             f"speed          RMS {100.0 * self.rms_speed:.2f} cm/s at the end, peak {self.peak_speed:.2f} m/s",
             f"penetration    {100.0 * self.overlap:.2f} % of the radius at most ({1e3 * self.depth:.4f} mm), "
             f"{100.0 * self.final_overlap:.2f} % at the end",
-            f"farthest       {self.farthest:.3f} m from the center of the start",
+            f"farthest       {self.farthest:.3f} m from the mean initial position",
         ]
         if self.held:
             rms, median = 100.0 * self.held_rms_speed, 100.0 * self.held_median_speed
-            lines.append(f"held           {self.held} by a magnet, RMS {rms:.2f} cm/s, median {median:.2f}")
+            lines.append(f"held           {self.held} by a magnet, RMS {rms:.2f} cm/s, median {median:.2f} cm/s")
         return lines
 
     def _details(self) -> list[str]:
