@@ -32,9 +32,11 @@ a surface cuts off, of little volume."""
 CLOSE = 1.75, 2.25
 """Distances at which the average over close boxes turns into their quadrupoles, in means of their sizes, too. In means
 of their longest sides the operator of a stack of five sheets would have an eigenvalue of -0.0025."""
-FINE = 0.8, 1.1
-"""Distances at which 4 × 4 × 2 points of a flat box turn into 2³, in means of sizes. Touching flat boxes are at 0.2 to
-0.8. The demagnetizing factor between boxes twice as wide as high is 7 % too large with 2³ points."""
+FINE = 1.0, 1.25
+"""Distances at which 4 × 4 × 2 points of a flat box turn into 2³, in means of sizes. The demagnetizing factor between
+touching boxes twice as wide as high is 7 % too large with 2³ points. The fields of a plate's cells almost cancel at a
+point above it, so cells with different points must be few: with 0.8 and 1.1 forces between plates are up to half as
+large."""
 FLAT = 0.57
 """Ratio of the shortest side to the next one below which whole cells of a body are flat."""
 OVERLAP_DEMAGNETIZATION = 0.45
