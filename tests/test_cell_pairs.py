@@ -132,7 +132,7 @@ def test_fields_of_halves_are_means_over_the_halves(device):
                 at = turn.inv().apply(positions[i] + 0.5 * side * points - x)
                 fields = turn.apply(boxes.field_tensor(at, np.full(3, 0.5 * size)) @ turn.inv().apply(m)) / size**3
                 expected[i] += share * np.einsum("p,pk,pk->k", weight.prod(axis=1), np.sign(points), fields)
-    error = np.linalg.norm(system._cells.difference_field.numpy()[:n] - expected) / np.linalg.norm(expected)
+    error = np.linalg.norm(system._cells.couplings.difference_field.numpy()[:n] - expected) / np.linalg.norm(expected)
     assert error < 0.03
 
 
@@ -218,11 +218,11 @@ def test_bodies_that_move_together_keep_their_tensors(device):
     poses = [(Rotation.identity(), np.zeros(3)), (POSES["touching"][0], np.array(POSES["touching"][1]))]
     system, _ = make_pair(bodies, poses, dtype="float32", device=device, susceptibility=math.inf)
     system.solve()
-    before = system._cell_pairs.arrays.matrix.numpy().copy()
+    before = system._cells.pairs.arrays.matrix.numpy().copy()
     spin = Rotation.from_rotvec([0.0, 0.0, 1e-3])
     put(system, bodies, [(spin * turn, spin.apply(place)) for turn, place in poses])
     system.solve()
-    changed = np.abs(system._cell_pairs.arrays.matrix.numpy() - before).max()
+    changed = np.abs(system._cells.pairs.arrays.matrix.numpy() - before).max()
     assert changed <= 1e-4 * np.abs(before).max()  # poses that rounding moves by more than the tolerance
 
 
@@ -235,7 +235,7 @@ def test_pairs_that_leave_and_enter_the_window(device):
 
     system, _ = make_pair(bodies, poses(0.027), dtype="float32", device=device, susceptibility=math.inf)
     system.solve()
-    pairs = system._cell_pairs
+    pairs = system._cells.pairs
 
     def field():
         pairs.arrays.h.zero_()

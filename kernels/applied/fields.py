@@ -20,6 +20,7 @@ from warpmag.kernels.applied import expansion, near_cells
 from warpmag.kernels.applied.sources import FieldSources, SourceKind, source_arrays_type
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.wrench import MU0
+from warpmag.kernels.shared.copies import put_copies, repeat_rows
 from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.pieces import cut
 from warpmag.kernels.shared.reductions import group_threads, most_blocks
@@ -55,17 +56,16 @@ class AppliedField:
 
     Args:
         targets: The targets, packed (``packing.PackedMoments``); read at each launch, as is ``base``.
-        worlds: World of each target, shape [t].
+        worlds: World of each target of one of ``sources.copies`` of all worlds, shape [t]; for points of all worlds.
         magnetized, movable: True for targets that fields magnetize, and for targets whose force is computed, shape [t].
             The fields at others serve energies only (:meth:`launch_left_out`).
-        base: Field that is added to [A/m], Warp array, shape [t].
+        base: Field that is added to [A/m], Warp array, shape [copies · t].
         points: True if targets are points of a probe, false if they are all moments.
 
     Attributes:
-        field: Magnetizing field: base and the field of all sources [A/m], shape [t].
-        acting: Field that exerts torques: base and the field of other bodies' sources [A/m], shape [t].
-        along: Derivatives of the field of other bodies' sources along x, y and z [A/m²], shape [t] each.
-        evaluated: True for targets at which :meth:`launch` evaluates these, NumPy, shape [t].
+        field: Magnetizing field: base and the field of all sources [A/m], shape [copies · t].
+        acting: Field that exerts torques: base and the field of other bodies' sources [A/m], shape [copies · t].
+        along: Derivatives of the field of other bodies' sources along x, y and z [A/m²], shape [copies · t] each.
     """
 
     balls: tuple = (0, 0.0, 0.0, 0)
@@ -81,8 +81,9 @@ class AppliedField:
         self.arrays = arrays = source_arrays_type(sources.dtype)()
         arrays.coils, arrays.solids, arrays.packed = sources.coil_arrays, sources.solid_arrays, sources.packed.packed
         arrays.targets.packed, arrays.targets.base = targets.packed, base
-        magnetized, movable = (np.broadcast_to(rows, self.count) for rows in (magnetized, movable))
-        self._lay_out_targets(np.asarray(worlds), magnetized, magnetized | movable)
+        self._copies, self._worlds = 1 if points else sources.copies, np.asarray(worlds)
+        magnetized, movable = (np.broadcast_to(rows, self._worlds.shape) for rows in (magnetized, movable))
+        self._lay_out_targets(magnetized, magnetized | movable)
         vec3 = wp.types.vector(3, sources.dtype)
         names = ("field", "acting", "along_x", "along_y", "along_z", *(["inside"] if points else []))
         results = [wp.zeros(self.count, dtype=vec3, device=sources.device) for _ in names]
@@ -94,24 +95,30 @@ class AppliedField:
     def _integers(self, values, kind=wp.int32) -> wp.array:
         return wp.array(np.ascontiguousarray(values, np.int32), dtype=kind, device=self.device)
 
-    def _lay_out_targets(self, worlds, magnetized, needed):
-        """Mark the kinds of the targets, and list the chunks of those that are ``needed`` and of the others."""
-        sources, targets, corrected = self.sources, self.arrays.targets, np.ones(self.count, int)
-        for solid in () if self._points else sources.solids:
-            corrected[solid.first : solid.first + solid.count] = 0
-        targets.kind, self.evaluated = self._integers(corrected + 2 * magnetized), needed
-        targets.chunk, targets.lists = self._chunks(worlds, needed)
-        self._left_out = self._chunks(worlds, ~needed)
+    def _in_copies(self, values, step=0) -> wp.array:
+        """Return an integer for each target of all copies on the device."""
+        return put_copies(np.asarray(values, np.int32), wp.int32, self.device, self._copies, step)
 
-    def _chunks(self, worlds, chosen) -> tuple[wp.array, wp.array]:
+    def _lay_out_targets(self, magnetized, needed):
+        """Mark the kinds of the targets, and list the chunks of those that are ``needed`` and of the others."""
+        targets, corrected = self.arrays.targets, np.ones(len(needed), int)
+        for solid in () if self._points else self.sources.solids_of_copy:
+            corrected[solid.first : solid.first + solid.count] = 0
+        targets.kind, self._needed = self._in_copies(corrected + 2 * magnetized), needed
+        targets.chunk, targets.lists = self._chunks(needed)
+        self._left_out = self._chunks(~needed)
+
+    def _chunks(self, chosen) -> tuple[wp.array, wp.array]:
         """Return the chunks of chosen targets, each in one world, and their ranges of coils and maps."""
-        sources, worlds = self.sources, np.where(chosen, worlds, -1)
+        sources, worlds = self.sources, np.where(chosen, self._worlds, -1)
         edges = np.flatnonzero(np.diff(worlds, prepend=-1, append=-1))
         begin, end = edges[:-1], edges[1:]
         of_world = worlds[begin] >= 0
         _, first, last = cut(begin[of_world], end[of_world], CHUNK)
-        world = worlds[first].astype(int)
-        chunks = self._integers(np.column_stack([first, last - first, sources.bodies_of(world)]), wp.vec4i)
+        pieces = np.column_stack([first, last - first, worlds[first].astype(int)])
+        steps = [len(worlds), 0, sources.world_count // self._copies]
+        first, count, world = repeat_rows(pieces, self._copies, steps).T
+        chunks = self._integers(np.column_stack([first, count, sources.bodies_of(world)]), wp.vec4i)
         return chunks, self._integers(np.stack([sources.lists[world], sources.lists[world + 1]], axis=1), wp.vec2i)
 
     def run_passes(self, first: int, last: int, items: int, group: int, share: int):
@@ -119,7 +126,7 @@ class AppliedField:
         cuda, key = self.device.is_cuda, (first, last)
         if items and key not in self._commands:
             sources, pass_and_group = self.sources, (first, group) if cuda else (-1, 1)
-            switches = bool(sources.applied), bool(sources.solids), self.cell_count > 0, bool(self.rates)
+            switches = bool(sources.applied), bool(sources.solids_of_copy), self.cell_count > 0, bool(self.rates)
             kernel = _kernel(sources.dtype, *pass_and_group, *switches, self.balls)
             sizes = dict(threads=threads_for(items, share), gpu_threads=group * items)
             of_cells = dict.fromkeys((FIND_CELLS, AT_CELLS, AT_NEIGHBORS, ON_CELLS), self.arrays.cells.active)
@@ -152,7 +159,7 @@ class AppliedField:
 
     def _launch_at_targets(self):
         """Launch the evaluation at the chunks of targets."""
-        group = group_threads(self.device) if self.sources.solids else 1
+        group = group_threads(self.device) if self.sources.solids_of_copy else 1
         share = _TARGETS_PER_THREAD // max(1, int(np.diff(self.sources.lists).max(initial=0)))
         evaluation = AT_POINTS if self._points else AT_TARGETS
         self.run_passes(evaluation, evaluation, CHUNK * self.arrays.targets.chunk.shape[0], group, max(share, 1))
@@ -238,37 +245,42 @@ class AppliedForces(AppliedField):
         super().__init__(sources, sources.packed, worlds, base, points=False, magnetized=magnetized, movable=movable)
         self.expansion, ball_indices = None, np.zeros(0, int)
         if balls is not None and np.any(balls):
-            self.balls, ball_indices = (1, *constants), np.flatnonzero(balls)
-            self._lay_out_balls(ball_indices, np.asarray(worlds))
-        source_of_moment = np.full(self.count, -1)
-        bodies = len(sources.applied) + np.arange(len(sources.solids))
-        source_of_moment[[solid.first for solid in sources.solids]] = bodies
+            self.balls, ball_indices = (1, *constants), np.flatnonzero(repeat_rows(balls, self._copies))
+            self._lay_out_balls(ball_indices)
+        source_of_moment, solids = np.full(len(self._worlds), -1), self.sources.solids_of_copy
+        source_of_moment[[solid.first for solid in solids]] = len(sources.applied) + np.arange(len(solids))
         self._moves = bool(np.any(movable))
         self._fine_tables: dict[str, wp.array] | None = None
-        self.movable, self._source = self._integers(np.asarray(movable, bool)), self._integers(source_of_moment)
-        self._worlds, self._ball_worlds = np.asarray(worlds), np.asarray(worlds)[ball_indices]
-        self._lay_out_rows(np.zeros(0, int))
+        self.movable = self._in_copies(np.asarray(movable, bool))
+        self._source = self._in_copies(source_of_moment, len(solids))
+        world_edges = np.searchsorted(self._worlds, np.arange(sources.world_count // self._copies))
+        self._world_edges = np.append(repeat_rows(world_edges, self._copies, len(self._worlds)), self.count)
+        self._ball_edges = np.searchsorted(ball_indices, self._world_edges)
+        self._lay_out_rows(np.zeros_like(self._world_edges))
 
     def include_cells(self, bodies, rotations, forces, torques):
         """Average the fields of permanent bodies over cells near them from now on.
 
         Args:
-            bodies: The bodies of cells (``near_cells.NearCellBody``), in the order of ``rotations``; None for a body
-                that takes no part.
+            bodies: The bodies of cells of a copy of the worlds (``near_cells.NearCellBody``), in the order of
+                ``rotations``; None for a body that takes no part.
             rotations: Rotation from each body's frame to the world, Warp array, shape [bodies].
             forces, torques: Forces [N] and torques [N·m] to add to, Warp arrays, shape [n].
         """
-        sources, cells = self.sources, self.arrays.cells
-        ranges, movable = sources.bodies_of(self._worlds), self.movable.numpy()
-        near_cells.lay_out(cells, bodies, rotations, sources.solids, ranges, movable, sources.dtype, self.device)
-        cells.forces, cells.torques = forces, torques
+        sources, cells, copies = self.sources, self.arrays.cells, self._copies
+        solids, ranges = self.sources.solids_of_copy, sources.bodies_of(self._worlds)
+        near_cells.lay_out(cells, bodies, rotations, solids, ranges, sources.dtype, self.device, copies)
+        cells.movable, cells.forces, cells.torques = self.movable, forces, torques
         self.cell_count = cells.cell.shape[0]
-        self._lay_out_rows(self._worlds[cells.cell.numpy()[:, 0]])
+        first_copy = cells.cell[: self.cell_count // copies].numpy()[:, 0]
+        edges = np.searchsorted(first_copy, self._world_edges[: sources.world_count // copies])
+        self._lay_out_rows(np.append(repeat_rows(edges, copies, len(first_copy)), self.cell_count))
         self._commands.clear()
 
-    def _lay_out_balls(self, ball_indices, worlds):
+    def _lay_out_balls(self, ball_indices):
         sources, balls = self.sources, self.arrays.balls
-        world = worlds[ball_indices].astype(int)
+        copy, ball = np.divmod(ball_indices, len(self._worlds))
+        world = self._worlds[ball].astype(int) + sources.world_count // self._copies * copy
         balls.ball = self._integers(np.column_stack([ball_indices, world, sources.bodies_of(world)]), wp.vec4i)
         balls.points, balls.tables = (
             wp.array(values.ravel(), dtype=sources.dtype, device=self.device)
@@ -277,16 +289,21 @@ class AppliedForces(AppliedField):
         shape = -(-self.count // CHUNK), expansion.EXPANSION_ROWS, CHUNK
         self.expansion = balls.expansion = wp.zeros(shape, dtype=sources.dtype, device=self.device)
 
-    def _lay_out_rows(self, cell_worlds):
-        """List the rows of each reaction that is computed: ranges of targets, of balls and of cells."""
+    def _lay_out_rows(self, cell_edges):
+        """List the rows of each reaction that is computed: ranges of targets, of balls and of cells.
+
+        ``cell_edges`` is the first cell of each world, and the end, shape [worlds + 1].
+        """
         sources, parts = self.sources, []
-        item_worlds = {OF_TARGETS: self._worlds, OF_BALLS: self._ball_worlds, OF_CELLS: cell_worlds}
-        of_source = (*sources.applied, *sources.solids)
-        movable = np.array([source.movable for source in of_source], bool)
-        world = np.array([source.world for source in of_source], int)
-        is_solid = np.arange(len(of_source)) >= len(sources.applied)
-        for kind, worlds in item_worlds.items():
-            first, end = np.searchsorted(worlds, world), np.searchsorted(worlds, world + 1)
+        edges_of = {OF_TARGETS: self._world_edges, OF_BALLS: self._ball_edges, OF_CELLS: cell_edges}
+        applied, solids = sources.applied, sources.solids_of_copy
+        solids_move = repeat_rows(np.array([solid.movable for solid in solids], bool), self._copies)
+        movable = np.concatenate([np.array([source.movable for source in applied], bool), solids_move])
+        world = np.concatenate([np.array([source.world for source in applied], int), sources.solid_worlds])
+        is_solid = np.arange(len(world)) >= len(applied)
+        in_world = np.where(world >= 0, world, sources.world_count)  # sources of all worlds have no rows
+        for kind, edges in edges_of.items():
+            first, end = edges[in_world], np.append(edges[1:], edges[-1])[in_world]
             reacts = movable & is_solid if kind == OF_CELLS else movable
             step = np.maximum(_PER_ROW[kind], -(-(end - first) // _MOST_ROWS))
             source, *ends = cut(first, np.where(reacts, end, first), step)
@@ -299,7 +316,7 @@ class AppliedForces(AppliedField):
         arrays.only = self._integers(movable & self._acts_alone(world))
         arrays.partial = wp.zeros((len(rows), 6), dtype=dtype, device=device)
         self.wrenches = arrays.wrench = wp.zeros((len(movable), 7), dtype=dtype, device=device)
-        world_has_several_solids = len(sources.solids) > len(np.unique(sources.solid_worlds))
+        world_has_several_solids = len(sources.solid_worlds) > len(np.unique(sources.solid_worlds))
         self._reacts, self._adds = len(rows) > 0, len(rows) > 0 or world_has_several_solids
 
     def _acts_alone(self, world) -> np.ndarray:
@@ -307,11 +324,11 @@ class AppliedForces(AppliedField):
 
         Moments of permanent bodies do not count as targets. ``world`` are the worlds of the sources, -1 for all.
         """
-        missing = ~self.evaluated
-        for solid in self.sources.solids:
+        missing = ~self._needed
+        for solid in self.sources.solids_of_copy:
             missing[solid.first : solid.first + solid.count] = False
         alone = np.bincount(world[world >= 0], minlength=self.sources.world_count) + (world < 0).sum() == 1
-        alone[self._worlds[missing]] = False
+        alone.reshape(self._copies, -1)[:, self._worlds[missing]] = False
         return (world >= 0) & alone[world]
 
     def enable_rates(self, motion):
@@ -383,7 +400,7 @@ class AppliedForces(AppliedField):
         energies, arrays = np.zeros(self.count), self.arrays
         if self.cell_count:
             energies[arrays.cells.cell.numpy()[:, 0]] = MU0 * near_cells.energies(arrays.cells)
-        if len(self.sources.solids) > 1:
+        if len(self.sources.solid_worlds) > 1:
             energies[[solid.first for solid in self.sources.solids]] = self._energies_between_bodies()
         return energies
 

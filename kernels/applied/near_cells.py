@@ -12,6 +12,7 @@ import warp as wp
 
 from warpmag.kernels.applied.solids import of_each_shape
 from warpmag.kernels.material.curves import curve_slope, inverse_curve_ratio
+from warpmag.kernels.shared.copies import put_copies, repeat_rows
 from warpmag.kernels.shared.native import native_options
 from warpmag.kernels.shared.reductions import most_blocks
 
@@ -116,8 +117,10 @@ def _table(coupling, kind: int, scalar) -> dict[str, np.ndarray]:
     }
 
 
-def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solids, solid_ranges, movable, dtype, device):
+def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solids, solid_ranges, dtype, device, copies=1):
     """Fill the struct ``arrays`` for bodies of cells; None stands for a body that takes no part.
+
+    The bodies are those of one of ``copies`` of all worlds.
 
     Args:
         arrays: The struct of :func:`cell_arrays_type`.
@@ -125,13 +128,16 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solids, so
         rotations: Rotation from each body's frame to the world, Warp array, shape [bodies].
         solids: The permanent bodies (``solids.SolidMagnet``).
         solid_ranges: Range of the permanent bodies in the world of each moment, shape [n, 2].
-        movable: True for moments whose force is evaluated, shape [n].
         dtype: Warp scalar type.
         device: Warp device.
+        copies: Number of copies.
     """
 
     def put(values, kind=wp.int32):
         return wp.array(np.ascontiguousarray(values), dtype=kind, device=device)
+
+    def put_cells(values, kind, step=0):
+        return put_copies(values, kind, device, copies, step)
 
     numbers = sorted((k for k, body in enumerate(bodies) if body is not None), key=lambda k: bodies[k].first)
     used = [bodies[number] for number in numbers]
@@ -149,24 +155,24 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solids, so
     of_bodies[:, :2] -= (np.cumsum(counts) - counts).astype(np.int32)[:, None]  # rows and moments count up in a body
     cells = np.repeat(of_bodies, counts, axis=0)
     cells[:, :2] += np.arange(len(cells), dtype=np.int32)[:, None]
-    arrays.row, arrays.cell = put(cells[:, 0]), put(cells[:, 1:], wp.vec4i)
+    steps = [len(solid_ranges), len(bodies), len(solids), len(solids)]
+    arrays.row, arrays.cell = put_cells(cells[:, 0], wp.int32), put_cells(cells[:, 1:], wp.vec4i, steps)
     grids = np.zeros((len(bodies), 9))
     grids[numbers] = np.array([_axes(body.coupling.grid_rotation) for body in shapes])[kind]
-    arrays.grid, arrays.rotation, arrays.point = put(grids, dtype), rotations, put(unit_points().ravel(), dtype)
+    arrays.grid, arrays.rotation = put(repeat_rows(grids, copies), dtype), rotations
+    arrays.point = put(unit_points().ravel(), dtype)
     arrays.response = put(np.concatenate([body.response.ravel() for body in shapes]), dtype)
     potentials = [solid.shape.potential_table() for solid in of_each_shape(solids).values()]
     ends = np.cumsum([len(potential) for potential in potentials])
     arrays.cylinder = put([end - len(p) if len(p) else -1 for end, p in zip(ends, potentials, strict=True)])
     arrays.cylinders = put(np.concatenate(potentials), dtype)
-    arrays.movable = put(movable)
-    arrays.wrench = wp.empty((len(cells), 6), dtype=dtype, device=device)
-    arrays.near = wp.zeros(len(cells), dtype=wp.int32, device=device)
-    arrays.factor = wp.zeros(len(cells), dtype=dtype, device=device)
-    arrays.change, arrays.steepness = (
-        wp.zeros(len(cells), dtype=wp.types.vector(3, dtype), device=device) for _ in range(2)
+    count, vec3 = copies * len(cells), wp.types.vector(3, dtype)
+    arrays.wrench = wp.empty((count, 6), dtype=dtype, device=device)
+    arrays.near, arrays.factor, arrays.change, arrays.steepness = (
+        wp.zeros(count, dtype=kind, device=device) for kind in (wp.int32, dtype, vec3, vec3)
     )
     # large, and read only where a pass has written it before: zeros would take longer than all else on a CPU
-    arrays.potential = wp.empty(len(cells) * 6 * FACE_POINTS, dtype=dtype, device=device)
+    arrays.potential = wp.empty(count * 6 * FACE_POINTS, dtype=dtype, device=device)
 
 
 @cache

@@ -5,14 +5,15 @@ kernels take. Targets are moments, or points of a probe.
 """
 
 from enum import IntEnum
-from functools import cache
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
 from warpmag.kernels.applied.near_cells import cell_arrays_type
-from warpmag.kernels.applied.solids import INTEGER_TABLES, tables_of
+from warpmag.kernels.applied.solids import INTEGER_TABLES, SolidMagnet, tables_of
+from warpmag.kernels.shared.copies import repeat_records, repeat_rows
 
 PARAMETERS = 9  # largest number of parameters of a source, in addition to its table
 
@@ -171,10 +172,13 @@ def source_arrays_type(dtype):
 class FieldSources:
     """Coils, field maps and permanent bodies on a device.
 
-    ``solids`` are ordered by world. ``bias`` is M_r/χ of moments that respond to fields [A/m], shape [n].
+    ``solids`` are ordered by world, and those of one of ``copies`` of all worlds and moments. ``bias`` is M_r/χ of
+    moments that respond to fields [A/m], shape [n].
 
     Attributes:
-        applied, solids: The sources.
+        applied: Coils and field maps.
+        copies: Number of copies of the worlds.
+        solids_of_copy: Permanent bodies of a copy.
         coil_arrays, solid_arrays: The sources as structs.
         frames: Frame of each coil and map in the world, shape [coils], transforms; written by the caller before fields
             are evaluated.
@@ -184,9 +188,9 @@ class FieldSources:
         lists: First entry of each world in ``coil_arrays.list``, and the end of the list, NumPy.
     """
 
-    def __init__(self, applied, solids, packed, world_count: int, bias=None):
+    def __init__(self, applied, solids, packed, world_count: int, bias=None, copies: int = 1):
         """Copy the sources to the device."""
-        self.applied, self.solids, self.packed = tuple(applied), tuple(solids), packed
+        self.applied, self.solids_of_copy, self.packed, self.copies = tuple(applied), tuple(solids), packed, copies
         self.dtype, self.device, self.world_count = packed.dtype, packed.device, world_count
         self.coil_arrays = coils = coil_arrays_type(self.dtype)()
         self.solid_arrays = bodies = solid_arrays_type(self.dtype)()
@@ -195,14 +199,22 @@ class FieldSources:
             bodies.bias = bias
         for name, values in self.tables().items() if solids else ():
             setattr(bodies, name, values)
-        self.solid_worlds = np.array([solid.world for solid in solids], int)
+        worlds = np.array([solid.world for solid in solids], int)
+        self.solid_worlds = repeat_rows(worlds, copies, world_count // copies)
         bodies.world = self._copy(self.bodies_of(self.solid_worlds), wp.vec2i)
         transform, identity = wp.types.transformation(self.dtype), [0.0] * 6 + [1.0]
         self.frames, self.solid_frames = (
-            self._copy(np.broadcast_to(identity, (len(sources), 7)), transform) for sources in (applied, solids)
+            self._copy(np.broadcast_to(identity, (count, 7)), transform)
+            for count in (len(applied), len(self.solid_worlds))
         )
         self.strengths = wp.zeros(len(applied), dtype=wp.types.vector(3, self.dtype), device=self.device)
         coils.frame, bodies.frame, coils.strength = self.frames, self.solid_frames, self.strengths
+
+    @cached_property
+    def solids(self) -> list[SolidMagnet]:
+        """Permanent bodies of all copies."""
+        steps = {"first": self.packed.count // self.copies, "world": self.world_count // self.copies}
+        return repeat_records(self.solids_of_copy, self.copies, **steps)
 
     def _lay_out_coils(self, coils):
         """Copy coils and maps to the device, with concatenated tables, and list the coils and maps of each world."""
@@ -227,9 +239,13 @@ class FieldSources:
 
     def tables(self, *, fine: bool = False) -> dict[str, wp.array]:
         """Return the tables of permanent bodies on the device, with more points on faces if ``fine``."""
+        tables = tables_of(self.solids_of_copy, fine=fine)
+        step = [0, self.packed.count // self.copies, 0, 0]
+        for name, change in (("body", step), ("size", 0)):
+            tables[name] = repeat_rows(tables[name], self.copies, change)
         return {
             name: wp.array(values, dtype=wp.int32 if name in INTEGER_TABLES else self.dtype, device=self.device)
-            for name, values in tables_of(self.solids, fine=fine).items()
+            for name, values in tables.items()
         }
 
     def bodies_of(self, worlds) -> np.ndarray:

@@ -86,7 +86,7 @@ class BodySteps:
     Args:
         bodies: For each body its first moment, the index of its rotation, Q − 1 in its frame, shape [n, 3, n, 3], and
             the largest eigenvalue of Q − 1. Bodies with the same array share it.
-        worlds: World of each moment, shape [moments].
+        worlds: World of each body.
         rotations: Rotations from the frames of bodies to the world (x, y, z, w).
         state: State of the solve (``solve_state``), bound to its moments.
     """
@@ -96,13 +96,13 @@ class BodySteps:
         device, dtype = state.h.device, state.packed.dtype
         ranges, gains = np.zeros((len(rotations), 2), np.int32), np.zeros(len(rotations))
         tables, begins, size, cells = [], {}, 0, []
-        for first, number, response, gain in bodies:
+        for (first, number, response, gain), world in zip(bodies, worlds, strict=True):
             count = len(response)
             if id(response) not in begins:
                 begins[id(response)], size = size, size + count * count
                 tables.append(response.transpose(0, 2, 1, 3).reshape(-1, 3, 3))
             own = np.arange(count)
-            columns = first + own, np.full(count, number), begins[id(response)] + count * own, worlds[first + own]
+            columns = first + own, np.full(count, number), begins[id(response)] + count * own, np.full(count, world)
             cells.append(np.stack(columns, axis=1))
             ranges[number], gains[number] = (first, count), gain
 

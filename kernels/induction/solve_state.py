@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.pairs.neighbors import CAPACITY
+from warpmag.kernels.shared.copies import put_copies, repeat_rows
 from warpmag.kernels.shared.native import CHUNK, LINE
 from warpmag.kernels.shared.pieces import cut
 from warpmag.kernels.shared.reductions import block_max, block_sum, fence
@@ -106,22 +107,17 @@ def state_type(dtype):
     return SolveState
 
 
-def allocate(worlds, inducible, dtype, device):
+def allocate(worlds, inducible, dtype, device, copies: int = 1):
     """Allocate the state of a solve; :func:`bind` sets the arrays that it shares.
 
-    The worlds of the moments do not decrease. In each world inducible moments come first.
+    The worlds of the moments do not decrease. In each world inducible moments come first. The state has ``copies`` of
+    these worlds.
     """
-    n, world_count = len(worlds), int(worlds[-1]) + 1 if len(worlds) else 0
     on_cpu = wp.get_device(device).is_cpu
-    size = CHUNK if on_cpu else BLOCK_CHUNK
-    target = np.flatnonzero(inducible)
-    world, counts = worlds[target], np.bincount(worlds[target], minlength=world_count)
-    begin = np.searchsorted(worlds, np.arange(world_count))
-    rows = np.stack([target, world, begin[world], (begin + counts)[world]], axis=1)
-    ends = np.cumsum(counts)
-    of_world, first, last = cut(ends - counts, ends, size)
-    chunk_begin = np.append(0, np.cumsum(-(-counts // size)))
-    vec3 = wp.types.vector(3, dtype)
+    n, size = copies * len(worlds), CHUNK if on_cpu else BLOCK_CHUNK
+    rows, chunks, chunk_begin = _rows_and_chunks(worlds, inducible, size, copies)
+    row_count, world_count, count = copies * len(rows[0]), len(chunk_begin) - 1, len(chunks)
+    vec3, vectors = wp.types.vector(3, dtype), CHUNK // (64 // wp.types.type_size_in_bytes(dtype)) if on_cpu else 1
 
     def put(values, kind):
         return wp.array(np.asarray(values, np.int32), dtype=kind, device=device)
@@ -129,10 +125,9 @@ def allocate(worlds, inducible, dtype, device):
     def zeros(names, shape, kind=wp.int32):
         return {name: wp.zeros(shape, dtype=kind, device=device) for name in names.split()}
 
-    count, vectors = len(first), CHUNK // (64 // wp.types.type_size_in_bytes(dtype)) if on_cpu else 1
     arrays = {
-        "row": put(rows, wp.vec4i),
-        "chunk": put(np.stack([first, last, of_world], axis=1), wp.vec3i),
+        "row": put_copies(rows[0], wp.vec4i, device, copies, rows[1]),
+        "chunk": put(chunks, wp.vec3i),
         "chunk_begin": put(chunk_begin, wp.int32),
         "converged": put(np.ones(world_count), wp.int32),  # worlds without inducible moments count as converged
         **zeros("near", (count if on_cpu else 0, CAPACITY, CHUNK)),
@@ -140,7 +135,7 @@ def allocate(worlds, inducible, dtype, device):
         **zeros("h0 h s mixed_s mixed_r best_s best_r mixed_g mixed_moment", n, vec3),
         **zeros("history_s history_r", (DEPTH, n), vec3),
         **zeros("past_field past_g", (2, n), vec3),
-        **zeros("past now swept", (count * size if on_cpu else len(rows), LINE), dtype),
+        **zeros("past now swept", (count * size if on_cpu else row_count, LINE), dtype),
         **zeros("step", n, dtype),
         "within_body": wp.ones(n, dtype=dtype, device=device),
         **zeros("sums", (count * vectors, COLUMNS), wp.float64),
@@ -152,9 +147,23 @@ def allocate(worlds, inducible, dtype, device):
     state = state_type(dtype)()
     for name, array in arrays.items():
         setattr(state, name, array)
-    largest = np.max(last - first, initial=0)
+    largest = np.max(chunks[:, 1] - chunks[:, 0], initial=0)
     state.block_moments = size if on_cpu else next(n for n in _CHUNK_SIZES if n >= largest)
     return state
+
+
+def _rows_and_chunks(worlds, inducible, size: int, copies: int):
+    """Return the rows of a copy of the worlds with their steps, chunks of all copies, and first chunks of worlds."""
+    n, world_count = len(worlds), int(worlds[-1]) + 1 if len(worlds) else 0
+    target = np.flatnonzero(inducible)
+    world, counts = worlds[target], np.bincount(worlds[target], minlength=world_count)
+    begin = np.searchsorted(worlds, np.arange(world_count))
+    rows = np.stack([target, world, begin[world], (begin + counts)[world]], axis=1).astype(np.int32)
+    ends = np.cumsum(counts)
+    of_world, first, last = cut(ends - counts, ends, size)
+    chunks = repeat_rows(np.stack([first, last, of_world], axis=1), copies, [len(rows), len(rows), world_count])
+    chunk_begin = np.append(0, np.cumsum(repeat_rows(-(-counts // size), copies)))
+    return (rows, [n, world_count, n, n]), chunks, chunk_begin
 
 
 def persistent_arrays(state) -> dict:

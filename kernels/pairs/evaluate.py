@@ -57,6 +57,7 @@ class PairEvaluation:
         quantity: Summed quantity: ``FIELD``; ``WRENCH``; ``FORCE``, with zero torque; or ``MUTUAL_FORCE``, a force
             where e is the moment itself.
         segments: Integers [k, 4]: targets begin and end, sources begin and end, as packed columns.
+        copies: Number of equal runs of the segments, each as many columns after the run before.
         targets: Packed targets with their overlapping sources (``packing.PackedMoments``), t of them.
         base: Base field [A/m], which also exerts torques, shape [t].
         out: Out, field [A/m] or forces [N] at the targets of ``segments``, shape [t]. The form ``MIRRORED`` also writes
@@ -80,8 +81,8 @@ class PairEvaluation:
     """
 
     def __init__(
-        self, quantity, segments, targets, sources, base, out, *, effective=None, with_torque=None, torques=None,
-        extra_parts=0, smoothing=0.0, form=None, sums=None, ranks=None,
+        self, quantity, segments, targets, sources, base, out, *, copies=1, effective=None, with_torque=None,
+        torques=None, extra_parts=0, smoothing=0.0, form=None, sums=None, ranks=None,
     ):  # fmt: skip
         """Choose the form and allocate its buffers."""
         segments = np.asarray(segments, np.int64).reshape(-1, 4)
@@ -91,7 +92,7 @@ class PairEvaluation:
         if self.form == MIRRORED:
             segments = segments[:1, [2, 3, 2, 3]]
         self._arrays = a = work_list.arrays_type(dtype)()
-        a.target, a.begin, a.end = work_list.target_rows(segments, device)
+        a.target, a.begin, a.end = work_list.target_rows(segments, device, copies)
         self.target, self.count, self.pair_count = a.target, a.target.shape[0], work_list.pair_count(segments)
         shared = self.form in (LOOP, MIRRORED) and self.pair_count >= _LEAST_SHARED["cuda" if device.is_cuda else "cpu"]
         self._ranks = ranks if shared else None

@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.pairs import neighbors
+from warpmag.kernels.shared.copies import put_copies
 
 PACKED_ROWS = 8
 PITCH = 128
@@ -88,7 +89,8 @@ class PackedMoments:
 
         Args:
             radii: Ball radii [m], Warp array, shape [n].
-            labels: Body label of each moment, exact in float32 up to 2²⁴, shape [n]; None means one body each.
+            labels: Body label of each moment, exact in float32 up to 2²⁴, shape [n]; None means one body each. A Warp
+                array is not copied; nor are groups.
             groups: World of each moment, shape [n]; None means one world.
             moving: True if the moments move by small steps, for which neighbor lists with a skin are faster. Otherwise
                 the lists are rebuilt each time.
@@ -98,9 +100,10 @@ class PackedMoments:
         self.radii, self.largest_radius, self._moving = radii, largest_radius, moving
 
         def integers(values):
-            return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=device)
+            is_array = isinstance(values, wp.array)
+            return values if is_array else wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=device)
 
-        self.labels = integers(np.arange(n, dtype=np.int32) if labels is None else labels)
+        self.labels = put_copies([0], wp.int32, device, n, 1) if labels is None else integers(labels)
         self.groups = wp.zeros(n, dtype=wp.int32, device=device) if groups is None else integers(groups)
         pitched = self._whole = self._pitched(PACKED_ROWS)
         pitched[3].fill_(largest_radius)

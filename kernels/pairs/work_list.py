@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.pairs.sums_cuda import LoopShape, choose_splits
+from warpmag.kernels.shared.copies import put_copies
 from warpmag.kernels.shared.team import MOST_THREADS, threads_for
 
 TILE_COLUMNS = 8
@@ -27,12 +28,18 @@ _LEAST_TARGETS = 32  # targets per tile, at least, so that loading its sources i
 _LANES = 16  # lanes of the widest vectors; stripes are a multiple of it, so that no lane is idle
 
 
-def target_rows(segments, device):
-    """Return the packed column, first source and end of sources of each target row, as Warp arrays."""
-    sizes, starts, segments = segments[:, 1] - segments[:, 0], row_starts(segments), segments.astype(np.int32)
-    target = np.arange(starts[-1], dtype=np.int32) + np.repeat(segments[:, 0] - starts[:-1].astype(np.int32), sizes)
-    rows = target, np.repeat(segments[:, 2], sizes), np.repeat(segments[:, 3], sizes)
-    return [wp.array(values, dtype=wp.int32, device=device) for values in rows]
+def target_rows(segments, device, copies: int = 1):
+    """Return the packed column, first source and end of sources of each target row, as Warp arrays.
+
+    The segments are ``copies`` of the first ones, one after the other, as many columns apart.
+    """
+    count = len(segments) // copies
+    step = int(segments[count, 0] - segments[0, 0]) if copies > 1 and count else 0
+    part = segments[:count].astype(np.int32)
+    sizes, starts = part[:, 1] - part[:, 0], row_starts(part)
+    target = np.arange(starts[-1], dtype=np.int32) + np.repeat(part[:, 0] - starts[:-1].astype(np.int32), sizes)
+    rows = target, np.repeat(part[:, 2], sizes), np.repeat(part[:, 3], sizes)
+    return [put_copies(values, wp.int32, device, copies, step) for values in rows]
 
 
 def row_starts(segments):

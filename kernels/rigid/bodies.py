@@ -179,11 +179,14 @@ def _set_external_field(
     field_in: wp.array[wp.vec3], world_in: wp.array[wp.int32], external_field_out: wp.array[wp.vec3]
 ):
     i = wp.tid()
-    external_field_out[i] = field_in[wp.min(world_in[i], field_in.shape[0] - 1)]
+    external_field_out[i] = field_in[wp.clamp(world_in[i], 0, field_in.shape[0] - 1)]
 
 
 def set_external_field(field, worlds, external_field):
-    """Set the external field [A/m] of each moment to that of its world; ``field`` may have one entry for all worlds."""
+    """Set the external field [A/m] of each moment to that of its world, -1 for a model without worlds.
+
+    ``field`` may have one entry for all worlds.
+    """
     wp.launch(_set_external_field, len(worlds), inputs=[field, worlds], outputs=[external_field], device=worlds.device)
 
 

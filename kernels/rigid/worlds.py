@@ -45,6 +45,21 @@ def choose(mask, world, chosen):
 
 
 @wp.kernel
+def _number_worlds(number_in: wp.array[wp.int32], world_in: wp.array[wp.int32], number_out: wp.array[wp.int32]):
+    i = wp.tid()
+    number_out[i] = number_in[world_in[i]]
+
+
+def number_worlds(numbers, world) -> wp.array:
+    """Return the number of each world in ``world``, shape [n], from those of all worlds."""
+    result = wp.empty_like(world)
+    wp.launch(
+        _number_worlds, len(world), inputs=[numbers, world], outputs=[result], device=world.device, record_tape=False
+    )
+    return result
+
+
+@wp.kernel
 def _restore_rows(
     mask_in: wp.array[wp.bool],
     world_in: wp.array[wp.int32],

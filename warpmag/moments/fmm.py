@@ -189,12 +189,11 @@ def fast_sums_for(method: str, moments, layout, extent: float | None, rtol: floa
         if not extent_known:
             body = layout.bodies[share_body.argmax()]
             raise InputError(f"method: 'fmm' needs body_extent, because the movable body {body} has several moments")
-    worlds, extent = layout.ranges(), extent or 0.0
-    counts = np.diff([0, *(end for _, _, end in worlds)])
-    pairs = counts @ counts
+    counts, copies, extent = np.bincount(layout.worlds), layout.copies, extent or 0.0
+    pairs = copies * (counts @ counts)
     crowding = _crowding(layout.radii, max(2.0 * moments.largest_radius, extent), rtol)
-    forces = counts[layout.worlds] @ layout.movable
-    fields = counts[layout.worlds] @ ~layout.permanent
+    forces = copies * (counts[layout.worlds] @ layout.movable)
+    fields = copies * (counts[layout.worlds] @ ~layout.permanent)
     is_faster = any(
         is_fast(number / crowding, moments.count, quantity, rtol, moments.device)
         for number, quantity in ((fields, Quantity.FIELD), (forces, Quantity.WRENCH))
@@ -202,7 +201,7 @@ def fast_sums_for(method: str, moments, layout, extent: float | None, rtol: floa
     if not moments.count or method == "direct" or (method == "auto" and not (extent_known and is_faster)):
         return NoFastSums()
     always_from = _LARGE_SHARE * pairs if method == "fmm" else math.inf
-    return SystemSums(moments, rtol, len(worlds), extent, crowding, always_from)
+    return SystemSums(moments, rtol, copies * len(counts), extent, crowding, always_from)
 
 
 def _crowding(radii: np.ndarray, reach: float, rtol: float) -> float:

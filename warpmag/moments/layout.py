@@ -12,6 +12,7 @@ from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.magnets import LINEAR_CURVE
 from warpmag.errors import InputError
 from warpmag.kernels.material.curves import CURVE_IDS, FIRST_TABLE, LINEAR, MIXED, CurveParameters, curve_tables
+from warpmag.kernels.shared.copies import put_copies, repeat_rows
 from warpmag.moments.arrays import check_bodies, host_positive, host_radii, host_scalars, shape_message
 
 _LARGE_BODY = 16
@@ -20,7 +21,10 @@ _LARGE_BODY = 16
 
 @dataclass(frozen=True)
 class MomentLayout:
-    """Geometry, world and body of each moment: NumPy arrays of shape [n]."""
+    """Geometry, world and body of each moment: NumPy arrays of shape [n].
+
+    A system may hold copies of these worlds, one after the other.
+    """
 
     radii: np.ndarray  # radius of the moment's ball [m]
     worlds: np.ndarray
@@ -30,6 +34,33 @@ class MomentLayout:
     single: np.ndarray  # True if the body has no other moment
     cells: np.ndarray  # True for a cell of a body with demagnetizing tensors
     aligned: np.ndarray  # True for an inducible single ball, parallel to the field, so that its torque is 0
+    copies: int = 1  # number of copies in the system
+    body_step: int = 0  # difference between the number of a body and that in the copy before
+
+    @property
+    def count(self) -> int:
+        """Number of moments of all copies."""
+        return self.copies * len(self.radii)
+
+    @property
+    def world_count(self) -> int:
+        """Number of worlds of a copy."""
+        return int(self.worlds.max(initial=-1)) + 1
+
+    def whole(self) -> "MomentLayout":
+        """Return the layout of all copies."""
+        if self.copies == 1:
+            return self
+        steps = {"worlds": self.world_count, "bodies": self.body_step}
+        arrays = {name: values for name, values in vars(self).items() if isinstance(values, np.ndarray)}
+        return MomentLayout(
+            **{name: repeat_rows(values, self.copies, steps.get(name, 0)) for name, values in arrays.items()}
+        )
+
+    def worlds_of(self, moments: np.ndarray) -> np.ndarray:
+        """Return the worlds of moments of all copies, by their indices."""
+        copy, moment = np.divmod(moments, max(len(self.radii), 1))
+        return self.worlds[moment] + self.world_count * copy
 
     @property
     def balls(self) -> np.ndarray:
@@ -86,7 +117,7 @@ class MomentLayout:
 
     def _edges(self) -> np.ndarray:
         """Return the first moment of each world, and the end of the last world."""
-        return np.searchsorted(self.worlds, np.arange(self.worlds.max(initial=-1) + 2))
+        return np.searchsorted(self.worlds, np.arange(self.world_count + 1))
 
 
 def _rows(*columns: np.ndarray) -> list[tuple]:
@@ -94,8 +125,8 @@ def _rows(*columns: np.ndarray) -> list[tuple]:
     return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
-def make_layout(radii, worlds, permanent, bodies, movable, dtype) -> MomentLayout:
-    """Return the layout of moments; all arguments but the radii may be None, see :class:`MomentSystem`."""
+def make_layout(radii, worlds, permanent, bodies, movable, dtype, copies: int = 1, body_step: int = 0) -> MomentLayout:
+    """Return the layout of moments; the arguments after the radii may be None, see :class:`MomentSystem`."""
     radii = host_radii("radii", radii, dtype)
     if radii.ndim != 1:
         raise InputError(shape_message("radii", "[n]", radii))
@@ -116,10 +147,14 @@ def make_layout(radii, worlds, permanent, bodies, movable, dtype) -> MomentLayou
         raise InputError(
             "worlds, permanent: moments must be ordered by world, from 0 on, the inducible ones of each first"
         )
-    check_bodies("bodies: numbers too large", int(bodies.max(initial=-1)) + 1, dtype)
+    largest = int(bodies.max(initial=-1)) + body_step * (copies - 1)
+    check_bodies("bodies: numbers too large", largest + 1, dtype)
     _, body, size = np.unique(bodies, return_inverse=True, return_counts=True)
     single = size[body] == 1
-    return MomentLayout(radii, worlds, permanent, bodies, movable, single, np.zeros(n, bool), ~permanent & single)
+    aligned = ~permanent & single
+    return MomentLayout(
+        radii, worlds, permanent, bodies, movable, single, np.zeros(n, bool), aligned, copies, body_step
+    )
 
 
 def with_cells(layout: MomentLayout, couplings) -> MomentLayout:
@@ -146,7 +181,10 @@ class MomentMaterial:
     curve_counts: Any = None  # moments of each curve of a list; None for one each
 
     def parameters(self, layout: MomentLayout, dtype, device) -> tuple[CurveParameters, np.ndarray]:
-        """Return the material for kernels, and the susceptibility of each moment, 1 for a permanent one, shape [n]."""
+        """Return the material of all copies for kernels, and the susceptibility of each moment, 1 for a permanent one.
+
+        The susceptibility has the shape [n].
+        """
         permanent, n = layout.permanent, len(layout.permanent)
         ids, measured = _curve_ids(self.curve, self.curve_counts, layout.cells)
         saturation = np.where(permanent, 1.0, host_scalars("saturation", self.saturation, n))
@@ -159,7 +197,7 @@ class MomentMaterial:
         host_positive("susceptibility", susceptibility, n, dtype, infinite=True)
 
         def upload(values, warp_type):
-            return wp.array(np.ascontiguousarray(np.broadcast_to(values, n)), dtype=warp_type, device=device)
+            return put_copies(np.broadcast_to(values, n), warp_type, device, layout.copies)
 
         used = np.unique(ids[~permanent])
         parameters = CurveParameters(

@@ -5,6 +5,7 @@ import warp as wp
 
 from warpmag.kernels.applied.fields import AppliedForces
 from warpmag.kernels.pairs.evaluate import FUSED, LOOP
+from warpmag.kernels.shared.copies import put_copies
 from warpmag.kernels.shared.leave_out import record_leave_out, record_list_active
 from warpmag.moments.system import MomentSystem
 
@@ -28,59 +29,72 @@ class RestingWorlds:
 
     def __init__(self, system: MomentSystem):
         """Copy the work lists of ``system``."""
-        self._system, self._launches, self._kept = system, [], []
+        self._system, self._launches, self._kept, self._layout = system, [], [], system._layout
         self._lists: dict[bytes, wp.array] = {}
-        worlds, on_gpu = system.worlds, system.device.is_cuda
-        self._add(system._packed.active_groups, worlds, _NONE)
+        on_gpu, groups = system.device.is_cuda, system.world_of_moments
+        self._add(system._packed.active_groups, groups, _NONE)
         evaluations = [system._permanent_field, system._inducible_field]
         evaluations += [evaluation for parts in system._wrench.values() for evaluation in parts]
         for evaluation in evaluations:
             if evaluation.form in (LOOP, FUSED):
-                self._add(evaluation.tiles, worlds[_column(evaluation.tiles, 2)], _TILE_ROWS, _TILE_SOURCES)
+                self._add(evaluation.tiles, self._worlds_of(evaluation.tiles, 2), _TILE_ROWS, _TILE_SOURCES)
             if on_gpu and evaluation.form != FUSED:
                 evaluation.finish_active(self._list(evaluation.target))
         if on_gpu:
             system._induction.active = self._list(system._induction.row)
-        if system._cells is not None and on_gpu:
-            system._cells.sum_active(self._list)
-        elif system._cells is not None:
-            self._add(system._cells.chunks, worlds[_column(system._cells.chunks, 0)], _COUNT)
+        couplings = None if system._cells is None else system._cells.couplings
+        if couplings is not None and on_gpu:
+            couplings.sum_active(self._list)
+        elif couplings is not None:
+            self._add(couplings.chunks, self._worlds_of(couplings.chunks), _COUNT)
         if system.source_interaction is not None:
             self._add_sources(system.source_interaction)
 
+    def _worlds_of(self, entries: wp.array, column: int = 0) -> wp.array:
+        """Return the world of each entry of a list, which has a moment in a column."""
+        worlds = self._layout.worlds_of(_column(entries, column))
+        return wp.array(worlds, dtype=wp.int32, device=entries.device)
+
     def _list(self, entries: wp.array) -> wp.array:
-        """Return a list of the entries, each with a moment in its first column, that belong to no resting world."""
-        moments = _column(entries, 0)
+        """Return a list of the entries, each with a moment in its first column, that belong to no resting world.
+
+        The entries are equal in all copies of worlds.
+        """
+        device, layout, count = self._system.device, self._layout, len(entries) // self._layout.copies
+        moments = _column(entries[:count], 0) if count else np.zeros(0, int)
         if (key := moments.tobytes()) not in self._lists:
-            device = self._system.device
-            self._lists[key] = active = wp.zeros(len(moments) + 1, dtype=wp.int32, device=device)
-            world = wp.array(self._system.worlds[moments], dtype=wp.int32, device=device)
-            if len(moments):
-                self._launches.append(record_list_active(world, self._system.resting, active))
+            self._lists[key] = active = wp.zeros(len(entries) + 1, dtype=wp.int32, device=device)
+            worlds = layout.worlds[moments].astype(np.int32)
+            worlds = put_copies(worlds, wp.int32, device, layout.copies, layout.world_count)
+            if count:
+                self._launches.append(record_list_active(worlds, self._system.resting, active))
         return self._lists[key]
 
     def _add_sources(self, interaction: AppliedForces) -> None:
         """Add the lists of targets of sources, of cells near permanent bodies, and of reactions."""
-        worlds, arrays, sources = self._system.worlds, interaction.arrays, interaction.sources
-        chunks, rows, of_source = arrays.targets.chunk, arrays.row, (*sources.applied, *sources.solids)
-        if self._system.device.is_cuda:
+        arrays, sources, device = interaction.arrays, interaction.sources, self._system.device
+        chunks, rows = arrays.targets.chunk, arrays.row
+        if device.is_cuda:
             interaction.list_active(self._list)
         else:
-            self._add(chunks, worlds[_column(chunks, 0)], _COUNT)
+            self._add(chunks, self._worlds_of(chunks), _COUNT)
             if interaction.cell_count:
-                self._add(arrays.cells.cell, worlds[_column(arrays.cells.cell, 0)], _BODIES)
-        self._add(rows, np.array([of_source[s].world for s in _column(rows, 0)], int), _ITEMS)
-        self._add(interaction.movable, worlds, _ZERO)
+                self._add(arrays.cells.cell, self._worlds_of(arrays.cells.cell), _BODIES)
+        source_worlds = np.append([source.world for source in sources.applied], sources.solid_worlds).astype(int)
+        row_worlds = wp.array(source_worlds[_column(rows, 0)], dtype=wp.int32, device=device)
+        self._add(rows, row_worlds, _ITEMS)
+        self._add(interaction.movable, self._system.world_of_moments, _ZERO)
 
-    def _add(self, entries: wp.array, world: np.ndarray, *ranges: dict[str, int]) -> None:
+    def _add(self, entries: wp.array, worlds: wp.array, *ranges: dict[str, int]) -> None:
         """Add a list of entries with their worlds, and the columns to empty."""
         if not len(entries):
             return
-        system, whole = self._system, entries.numpy().reshape(len(entries), -1)
-        table = wp.array(ptr=entries.ptr, dtype=wp.int32, shape=whole.shape, device=system.device)
-        copy, of_world = (wp.array(values, dtype=wp.int32, device=system.device) for values in (whole, world))
+        columns = entries.size * wp.types.type_size_in_bytes(entries.dtype) // (4 * len(entries))
+        table = wp.array(ptr=entries.ptr, dtype=wp.int32, shape=(len(entries), columns), device=entries.device)
+        copy = wp.clone(table)
         self._kept.append((entries, table))
-        self._launches += [record_leave_out(copy, of_world, system.resting, entries=table, **ends) for ends in ranges]
+        resting = self._system.resting
+        self._launches += [record_leave_out(copy, worlds, resting, entries=table, **ends) for ends in ranges]
 
     def leave_out(self) -> None:
         """Launch the removal of the worlds that rest, and the return of the others."""

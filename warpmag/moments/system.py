@@ -10,15 +10,11 @@ import warp as wp
 from warpmag.declarations.magnets import check_force
 from warpmag.errors import InputError
 from warpmag.kernels.applied.fields import AppliedForces
-from warpmag.kernels.applied.near_cells import FACE_SPLIT, NearCellBody
 from warpmag.kernels.applied.solids import SolidMagnet
 from warpmag.kernels.applied.sources import AppliedSource, FieldSources
-from warpmag.kernels.cells.cell_pairs import CellPairs
-from warpmag.kernels.cells.couplings import CellCouplings
 from warpmag.kernels.eddy.eddy import EddyCurrents
 from warpmag.kernels.fmm.evaluation import sampled_error
 from warpmag.kernels.induction import solve_state
-from warpmag.kernels.induction.energy import launch_energy
 from warpmag.kernels.induction.solve_state import launch_add_bias, launch_start_cold
 from warpmag.kernels.material.curves import LINEAR
 from warpmag.kernels.near_contact import near_pairs, nonuniform
@@ -27,17 +23,20 @@ from warpmag.kernels.pairs.evaluate import GIVEN, PairEvaluation
 from warpmag.kernels.pairs.packing import PackedMoments, launch_divide_by_volume
 from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.pairs.work_list import pair_count
-from warpmag.kernels.pairs.wrench import MU0, launch_zeeman_moments
+from warpmag.kernels.pairs.wrench import launch_zeeman_moments
+from warpmag.kernels.shared.copies import put_copies, repeat_records, repeat_rows
 from warpmag.moments.arrays import host_array, resolve_device, resolve_dtype, shape_message, vec3_type
 from warpmag.moments.body_steps import make_body_steps
 from warpmag.moments.dynamics import make_dynamics
 from warpmag.moments.fmm import SystemSums, fast_sums_for
+from warpmag.moments.force_sums import force_sums
 from warpmag.moments.layout import MomentLayout, MomentMaterial, change_material, make_layout, with_cells
 from warpmag.moments.ranks import current_ranks
 from warpmag.moments.settings import SolverSettings
+from warpmag.moments.system_cells import SystemCells
+from warpmag.moments.system_energies import SystemEnergies
 from warpmag.moments.system_gradients import SystemGradients
 from warpmag.shapes.demagnetization import Coupling
-from warpmag.shapes.face_charges import face_response
 
 
 class MomentSystem:
@@ -65,6 +64,9 @@ class MomentSystem:
         solids: Permanent bodies with a closed-form near field, ordered by world.
         faces: Flat faces of inducible bodies of ``couplings``, ordered by world. The contact model ``multipole`` has
             mirror images of balls in them.
+        copies: Number of copies of all this, one after the other: worlds with their moments, bodies, couplings, solids
+            and faces. Coils and field maps have no copies. Thousands of equal worlds are prepared in a moment.
+        body_step: Difference between the number of a body and that in the copy before.
         dtype: ``float32`` or ``float64``.
         device: Warp device; None means Warp's default.
 
@@ -94,7 +96,6 @@ class MomentSystem:
         dynamics: Magnetization dynamics of the inducible moments (``moments.dynamics``).
         is_fast: True if the fast multipole method sums the pairs.
         fmm_rtol: Relative error of the fields by the fast multipole method; None without it.
-        worlds: World of each moment, NumPy, shape [n].
         world_ranges: (First moment, first permanent moment, end) of each world.
         h: Field at the inducible moments [A/m], without a moment's own field, with the bias, shape [n]. The
             dynamics ``theta`` ends with M = f(H) in this field.
@@ -126,6 +127,8 @@ class MomentSystem:
         sources: Sequence[AppliedSource] = (),
         solids: Sequence[SolidMagnet] = (),
         faces: Sequence[IronFaces] = (),
+        copies: int = 1,
+        body_step: int = 0,
         dtype: str = "float32",
         device=None,
     ):
@@ -133,50 +136,67 @@ class MomentSystem:
         self.settings = settings = settings or SolverSettings()
         self.device, self.dtype = resolve_device(device), resolve_dtype(dtype)
         settings.check(dtype)
-        layout = with_cells(make_layout(radii, worlds, permanent, bodies, movable, self.dtype), couplings)
-        self.eddy, self._ranks, self._graph, self._permanent_fields = None, current_ranks(), None, None
+        layout = make_layout(radii, worlds, permanent, bodies, movable, self.dtype, copies, body_step)
+        layout = with_cells(layout, couplings)
+        self.eddy, self._ranks, self._graph = None, current_ranks(), None
         self.refresh: Callable[[], None] | None = None
         near = settings.contact_model == "multipole"
+        self._layout = layout
         self._allocate(layout, external_field)
         material = material or MomentMaterial()
         self.material, susceptibility = material.parameters(layout, self.dtype, self.device)
-        layout = self._make_bias(layout)
-        self._make_sources(layout, sources, solids)
+        self._layout = layout = self._make_bias(layout)
         rotatable = ~layout.aligned | settings.single_torque
-        self._rotatable = wp.array(rotatable.astype(np.int32), dtype=wp.int32, device=self.device)
+        self._rotatable = put_copies(rotatable.astype(np.int32), wp.int32, self.device, copies)
         self._fast = fast_sums_for(settings.method, self._packed, layout, body_extent, float(settings.rtol))
         self.is_fast, self.fmm_rtol = isinstance(self._fast, SystemSums), self._fast.rtol
+        self._make_sources(layout, sources, solids)
         self._make_field(layout, near)
-        in_worlds = self._make_cells(layout, couplings, {solid.first for solid in solids})
-        if self._cells is not None and solids:
-            self._include_cells(couplings, {solid.first for solid in solids})
-        self._make_wrench(layout, rotatable)
-        self._near = self._make_near_contacts(layout, rotatable, susceptibility, faces) if near else None
+        self._make_cells(layout, couplings, {solid.first for solid in solids})
+        wrench = {"with_torque": self._rotatable, "torques": self.torques, "ranks": self._ranks}
+        arrays = self._effective, self._packed, self._acting_field, self.forces
+        self._wrench = force_sums(layout, rotatable, self._fast, *arrays, **wrench)
+        self._near = None
+        if near:
+            self._near = self._make_near_contacts(layout, rotatable, susceptibility, faces, len(couplings))
         limits = float(settings.rtol), int(settings.max_evaluations)
         solve_state.bind(self._induction, self._packed, self.material, self.moments, *limits)
-        self._body_steps = make_body_steps(in_worlds, self.worlds, self.rotations, self._induction, settings.dynamics)
+        bodies = () if self._cells is None else self._cells.bodies
+        self._body_steps = make_body_steps(bodies, layout, self.rotations, self._induction, settings.dynamics)
         self.dynamics = make_dynamics(settings.dynamics, self._induction, step=settings.step, damping=settings.damping)
 
     def _allocate(self, layout: MomentLayout, external_field):
-        n, vec3 = len(layout.radii), vec3_type(self.dtype)
+        n, vec3, copies = layout.count, vec3_type(self.dtype), layout.copies
         self.positions, self.moments, self.forces, self.torques = (
             wp.zeros(n, dtype=vec3, device=self.device) for _ in range(4)
         )
-        field = host_array("external_field", external_field)
-        if field.shape not in ((3,), (n, 3)):
-            raise InputError(shape_message("external_field", f"[3] or [{n}, 3]", field))
-        self.external_field = wp.array(np.broadcast_to(field, (n, 3)), dtype=vec3, device=self.device)
-        radii, most = wp.array(layout.radii, dtype=self.dtype, device=self.device), layout.radii.max(initial=0.0)
-        self._packed = PackedMoments(radii, largest_radius=float(most), labels=layout.bodies, groups=layout.worlds)
+        field, shape = host_array("external_field", external_field), layout.radii.shape
+        if field.shape not in ((3,), (*shape, 3)):
+            raise InputError(shape_message("external_field", f"[3] or [{shape[0]}, 3]", field))
+        self.external_field = put_copies(np.broadcast_to(field, (*shape, 3)), vec3, self.device, copies)
+        self._packed = PackedMoments(
+            put_copies(layout.radii, self.dtype, self.device, copies),
+            largest_radius=float(layout.radii.max(initial=0.0)),
+            labels=put_copies(layout.bodies.astype(np.int32), wp.int32, self.device, copies, layout.body_step),
+            groups=put_copies(layout.worlds.astype(np.int32), wp.int32, self.device, copies, layout.world_count),
+        )
         self._effective = self._packed.vectors()
-        self._induction = state = solve_state.allocate(layout.worlds, ~layout.permanent, self.dtype, self.device)
+        arguments = layout.worlds, ~layout.permanent, self.dtype, self.device, copies
+        self._induction = state = solve_state.allocate(*arguments)
         self.h, self.residual, self.error, self.resting = state.h, state.residual, state.error, state.resting
         self.evaluations, self.converged = state.evaluations, state.converged
 
+    @cached_property
+    def worlds(self) -> np.ndarray:
+        """World of each moment, NumPy, shape [n]."""
+        return self._layout.whole().worlds
+
     def _make_bias(self, layout: MomentLayout) -> MomentLayout:
         """Allocate the bias of moments with recoil permeability, which are not aligned in the returned layout."""
-        recoils = (self.material.curve.numpy() == LINEAR) & ~layout.permanent
-        self.bias, self._biased = None, wp.array(np.flatnonzero(recoils), dtype=wp.int32, device=self.device)
+        n = len(layout.radii)
+        recoils = (self.material.curve.numpy()[:n] == LINEAR) & ~layout.permanent
+        self.bias = None
+        self._biased = put_copies(np.flatnonzero(recoils).astype(np.int32), wp.int32, self.device, layout.copies, n)
         if recoils.any():
             if self.settings.dynamics != "theta":
                 raise InputError(f"dynamics: {self.settings.dynamics!r} lacks recoil permeability, only 'theta' has it")
@@ -188,7 +208,9 @@ class MomentSystem:
         self.sources = self.source_interaction = None
         self._magnetizing_field = self._acting_field = self.external_field
         if sources or solids:
-            self.sources = FieldSources(sources, solids, self._packed, len(layout.ranges()), self.bias)
+            self.sources = FieldSources(
+                sources, solids, self._packed, layout.copies * layout.world_count, self.bias, layout.copies
+            )
             self.source_interaction = AppliedForces(
                 self.sources, layout.worlds, self.external_field, ~layout.permanent, layout.movable,
                 balls=layout.balls if self.settings.contact_model == "multipole" else None,
@@ -199,80 +221,38 @@ class MomentSystem:
 
     def _make_field(self, layout: MomentLayout, near: bool):
         """Prepare the fields of permanent and of inducible moments at inducible moments."""
-        self.worlds, self.world_ranges = layout.worlds, layout.ranges()
-        ranges, packed, state = np.reshape(self.world_ranges, (-1, 3)), self._packed, self._induction
+        ranges = repeat_rows(np.reshape(layout.ranges(), (-1, 3)), layout.copies, len(layout.radii))
+        self.world_ranges = list(zip(*ranges.T.tolist(), strict=True))
+        packed, state, copies = self._packed, self._induction, layout.copies
         of_permanent, of_inducible = ranges[:, [0, 1, 1, 2]], ranges[:, [0, 1, 0, 1]]
-        sums = self._fast.sums_of(Quantity.FIELD, pair_count(of_permanent), layout.permanent)
-        self._inducible_sums = self._fast.sums_of(Quantity.FIELD, pair_count(of_inducible), ~layout.permanent)
+        permanent = repeat_rows(layout.permanent, copies) if self.is_fast else layout.permanent
+        sums = self._fast.sums_of(Quantity.FIELD, pair_count(of_permanent), permanent)
+        self._inducible_sums = self._fast.sums_of(Quantity.FIELD, pair_count(of_inducible), ~permanent)
         arrays = packed, packed, self._magnetizing_field, state.h0
-        self._permanent_field = PairEvaluation(Quantity.FIELD, of_permanent, *arrays, sums=sums, ranks=self._ranks)
+        more = {"copies": copies, "ranks": self._ranks}
+        self._permanent_field = PairEvaluation(Quantity.FIELD, of_permanent, *arrays, sums=sums, **more)
         if self._permanent_field.pair_count == 0 and self.bias is None:
             state.h0 = self._magnetizing_field
         # near contacts write one more partial sum
-        more = {"extra_parts": int(near), "sums": self._inducible_sums, "ranks": self._ranks}
+        more |= {"extra_parts": int(near), "sums": self._inducible_sums}
         self._inducible_field = PairEvaluation(Quantity.FIELD, of_inducible, packed, packed, state.h0, self.h, **more)
 
     def _make_cells(self, layout: MomentLayout, couplings, closed_forms: set[int]):
-        """Prepare the corrections between cells. Return the couplings of bodies among the others of their worlds.
-
-        ``closed_forms`` are the first moments of bodies whose near field has a closed form, in place of corrections.
-        """
-        self._couplings, self._cells, self._cell_pairs, self.rotations, self.crowded = (), None, None, None, None
+        """Prepare the corrections between cells, and the averages of the fields of ``sources`` over cells."""
+        self._cells = self.rotations = self.crowded = None
         if couplings:
-            takes_part = [coupling.near and first not in closed_forms for first, coupling in couplings]
-            in_world = np.bincount(layout.worlds[[first for first, _ in couplings]], minlength=layout.worlds.max() + 1)
-            couplings = [(first, coupling.among(in_world[layout.worlds[first]])) for first, coupling in couplings]
-            self._couplings = couplings
-            parts = np.bincount(layout.worlds[[first for first, _ in couplings]], takes_part, len(in_world))
-            paired = bool(parts.max() > 1) or bool(parts[layout.worlds[layout.single_balls]].any())
-            self._cells = CellCouplings(couplings, self.moments, self.h, paired=paired)
-            self.rotations = self._cells.rotations
-            if paired:
-                self._cell_pairs = CellPairs(
-                    couplings, takes_part, self._cells, layout, self._rotatable, self._packed, self.h, self.forces,
-                    self.torques,
-                )  # fmt: skip
-                self.crowded = self._cell_pairs.crowded
-        return couplings
+            self._cells = cells = SystemCells(
+                layout, couplings, closed_forms, rotatable=self._rotatable, packed=self._packed, moments=self.moments,
+                h=self.h, forces=self.forces, torques=self.torques,
+            )  # fmt: skip
+            self.rotations, self.crowded = cells.rotations, cells.crowded
+            if closed_forms:
+                cells.average_sources(self.source_interaction)
 
-    def _include_cells(self, couplings, closed_forms: set[int]):
-        """Let permanent bodies act on the cells near them by averages; ``closed_forms`` as in :meth:`_make_cells`."""
-        bodies: list[NearCellBody | None] = [None] * len(couplings)
-        for number, (first, coupling) in enumerate(couplings):
-            if coupling.near and first not in closed_forms:
-                response = face_response(tuple(coupling.cell_sides), FACE_SPLIT)
-                bodies[number] = NearCellBody(first, coupling, response)
-        if any(bodies):
-            self.source_interaction.include_cells(bodies, self.rotations, self.forces, self.torques)
-
-    def _make_wrench(self, layout: MomentLayout, rotatable):
-        """Prepare forces on movable moments for each force law, and torques of the moments that ``rotatable`` marks."""
-        mutual, rotating = layout.runs(layout.movable & ~rotatable), layout.movable & rotatable
-        segments = [np.reshape(rows, (-1, 4)) for rows in (mutual, layout.wrench_runs(rotating))]
-        all_segments = np.reshape(mutual + layout.runs(rotating), (-1, 4))
-        pairs = pair_count(all_segments)
-
-        def evaluations(force, effective):
-            # moments with a torque come last: the others use the mirrored form, which writes the forces on all moments
-            parts = [(force, segments[0]), (Quantity.WRENCH, segments[1])]
-            if self._fast.uses_multipoles(Quantity.WRENCH, pairs):  # in one sum, so that actions equal reactions
-                parts = [(Quantity.WRENCH if len(segments[1]) else force, all_segments)]
-            return [
-                PairEvaluation(
-                    quantity, rows, self._packed, self._packed, self._acting_field, self.forces, effective=effective,
-                    with_torque=self._rotatable, torques=self.torques, sums=self._fast.sums_of(quantity, pairs),
-                    ranks=self._ranks,
-                )
-                for quantity, rows in parts
-                if len(rows)
-            ]  # fmt: skip
-
-        self._wrench = {
-            "kelvin": evaluations(Quantity.MUTUAL_FORCE, None),
-            "zeeman": evaluations(Quantity.FORCE, self._effective),
-        }
-
-    def _make_near_contacts(self, layout: MomentLayout, rotatable, susceptibility, faces):
+    def _make_near_contacts(self, layout: MomentLayout, rotatable, susceptibility, faces, coupling_count: int):
+        steps = {"first": len(layout.radii), "world": layout.world_count, "number": coupling_count}
+        faces, copies, layout = repeat_records(faces, layout.copies, **steps), layout.copies, layout.whole()
+        rotatable, susceptibility = (repeat_rows(values, copies) for values in (rotatable, susceptibility))
         magnets, worlds = layout.permanent | (self.material.curve.numpy() == LINEAR), {*layout.worlds[layout.balls]}
         for solid in () if self.sources is None else self.sources.solids:  # closed forms replace their moments
             magnets[solid.first : solid.first + solid.count] = solid.response > 0.0
@@ -301,6 +281,11 @@ class MomentSystem:
         return self._packed.labels
 
     @property
+    def world_of_moments(self):
+        """World of each moment on the device, shape [n]."""
+        return self._packed.groups
+
+    @property
     def count(self) -> int:
         """Number of moments n."""
         return self._packed.count
@@ -319,7 +304,7 @@ class MomentSystem:
     def gradients(self) -> SystemGradients:
         """Gradients of solves and forces. Their buffers are allocated at the first access."""
         arrays = self._packed, self._induction, self.material, self.worlds, self.world_ranges
-        cells = self._couplings, self._cell_pairs
+        cells = ((), None) if self._cells is None else (self._cells.bodies, self._cells.pairs)
         return SystemGradients(*arrays, self.rtol, self.fmm_rtol, self.source_interaction, *cells)
 
     def start_cold(self, chosen: wp.array | None = None):
@@ -336,8 +321,8 @@ class MomentSystem:
         self._packed.request_search(chosen)
         if self._near is not None:
             self._near.start_cold(chosen)
-        if self._cell_pairs is not None:
-            self._cell_pairs.request_search(chosen)
+        if self._cells is not None:
+            self._cells.request_search(chosen)
 
     def start_from(self, magnetizations):
         """Start the next solve from given magnetizations [A/m], a Warp array of vectors, shape [n]."""
@@ -368,8 +353,8 @@ class MomentSystem:
         parts["dynamics"] = self.dynamics.persistent_arrays()
         if self._near is not None:
             parts["near"] = self._near.persistent_arrays()
-        if self._cell_pairs is not None:
-            parts["cell_pairs"] = self._cell_pairs.persistent_arrays()
+        if self._cells is not None:
+            parts["cell_pairs"] = self._cells.persistent_arrays()
         inner = {f"{part}.{name}": array for part, arrays in parts.items() for name, array in arrays.items()}
         material = {"saturation": self.material.saturation, "slope": self.material.slope}
         return {"moments": self.moments, **material, **inner}
@@ -415,8 +400,8 @@ class MomentSystem:
             launch_add_bias(self.bias, self._biased, self._induction.h0)
         if self._inducible_field.count == 0:
             return
-        if self._cell_pairs is not None:
-            self._cell_pairs.find()
+        if self._cells is not None:
+            self._cells.find_pairs()
         self.dynamics.start()
         if self._near is not None:
             near_pairs.wait(self._near)
@@ -425,9 +410,6 @@ class MomentSystem:
         """Launch one field evaluation at the inducible moments and one step of the dynamics."""
         self.dynamics.refine()
         self._sum_field()
-        self._add_cell_pairs()
-        if self._cells is not None:
-            self._cells.launch()
         if self._body_steps is not None:
             self._body_steps.launch()
         self.dynamics.iterate()
@@ -447,9 +429,6 @@ class MomentSystem:
     def evaluate(self):
         """Launch one evaluation of ``h`` at the inducible moments, without a step."""
         self._sum_field()
-        self._add_cell_pairs()
-        if self._cells is not None:
-            self._cells.launch()
         self._wait_for_near_contacts()
 
     def evaluate_again(self):
@@ -458,19 +437,16 @@ class MomentSystem:
         if self._inducible_field.count:
             self.evaluate()
 
-    def _add_cell_pairs(self):
-        """Launch the corrections of the field between cells of different bodies."""
-        if self._cell_pairs is not None:
-            self._cell_pairs.add_field()
-
     def _sum_field(self):
-        """Launch the sums of the field at the inducible moments; :meth:`_wait_for_near_contacts` must follow."""
+        """Launch all sums of the field at inducible moments; :meth:`_wait_for_near_contacts` must follow."""
         near = self._near
         if near is None:
             self._inducible_field.launch()
         else:
             near_pairs.launch_sweeps(near)
             self._inducible_field.launch(wait=lambda: near_pairs.wait(near, for_field=True))
+        if self._cells is not None:
+            self._cells.add_field()
 
     def _wait_for_near_contacts(self):
         """Make later launches wait for the near contacts, which run on a stream of their own."""
@@ -487,8 +463,8 @@ class MomentSystem:
             launches["sources"] = (self.source_interaction.launch, 1)
         if self._permanent_field.pair_count:
             launches["permanent moments"] = (self._permanent_field.launch, 1)
-        if self._cell_pairs is not None:
-            launches["pairs of cells"] = (self._cell_pairs.find, 1)
+        if self._cells is not None and self._cells.pairs is not None:
+            launches["pairs of cells"] = (self._cells.find_pairs, 1)
         if self._inducible_field.count:
             launches["evaluations"] = (self.evaluate, int(self.evaluations.numpy().max(initial=1)))
         return {**launches, "forces": (self.apply_forces, 1)}
@@ -517,32 +493,11 @@ class MomentSystem:
         It is the energy of all fields and of the magnetization curves. Its negative gradient with respect to positions
         is the Kelvin force. Permanent moments of one body add a constant. Waits for the device.
         """
-        if self.settings.contact_model != "dipole":
-            raise InputError("contact_model: the energy can be computed for dipole only, not for multipole")
-        energies = self._moment_energies()
-        if self.source_interaction is not None:
-            energies += self.source_interaction.energies()
-        if self.bias is not None:  # the energy is 0 at M = M_r without field
-            bias = np.linalg.norm(self.bias.numpy().astype(float), axis=1)
-            volumes = 4.0 / 3.0 * np.pi * self.radii.numpy().astype(float) ** 3
-            energies += 0.5 * MU0 * volumes * self.material.slope.numpy() * bias**2
-        return np.array([energies[first:last].sum() for first, _, last in self.world_ranges])
+        return self._energies.of_worlds()
 
-    def _moment_energies(self) -> np.ndarray:
-        """Return the energy of each moment [J] in the fields of moments and in the applied field, shape [n]."""
-        if self._permanent_fields is None:  # only the energy needs the field of permanent moments at each other
-            segments = [(middle, last, middle, last) for _, middle, last in self.world_ranges if last > middle]
-            zero, out = wp.zeros_like(self.moments), wp.zeros_like(self.moments)
-            evaluation = PairEvaluation(Quantity.FIELD, segments, self._packed, self._packed, zero, out)
-            self._permanent_fields = evaluation, out
-        evaluation, permanent_field = self._permanent_fields
-        evaluation.launch()
-        if self.source_interaction is not None:
-            self.source_interaction.launch_left_out()
-        energies = wp.zeros(self.count, dtype=wp.float64, device=self.device)
-        fields = self._induction.h, self._induction.h0, permanent_field, self._acting_field
-        launch_energy(self.radii, self.moments, self.material, *fields, energies)
-        return energies.numpy()
+    @cached_property
+    def _energies(self) -> SystemEnergies:
+        return SystemEnergies(self, self._packed, self._induction.h0, self._acting_field)
 
     def apply_forces(self, force=None):
         """Launch the forces and torques on the moments after :meth:`solve`; ``force`` overrides the force law."""
@@ -556,8 +511,8 @@ class MomentSystem:
             near_pairs.launch_begin_forces(near)
         for evaluation in self._wrench[force]:
             evaluation.launch()
-        if self._cell_pairs is not None:
-            self._cell_pairs.add_forces()
+        if self._cells is not None:
+            self._cells.add_forces()
         expanded = interaction is not None and interaction.expansion is not None
         if expanded:
             interaction.expand()

@@ -19,6 +19,7 @@ from warpmag.kernels.rigid.distant import (
     SystemArrays,
     WorldChoice,
 )
+from warpmag.kernels.shared.copies import put_copies
 from warpmag.moments.ranks import current_ranks
 from warpmag.moments.resting_worlds import RestingWorlds
 from warpmag.moments.system import MomentSystem
@@ -30,7 +31,7 @@ from warpmag.shapes.distant_response import LEAST_REPLACED_CELLS, MOST_REPLACED_
 def distant_bodies(
     model: newton.Model, magnets: list[BodyMagnet], settings: MagneticSettings, *, method: str, has_sources: bool
 ) -> dict[int, list[DistantBody]]:
-    """Return the few moments of iron bodies at their levels by the index of the magnet.
+    """Return the few moments of iron bodies among ``magnets`` at their levels, by the index of the magnet.
 
     There are none where the model needs cells always.
 
@@ -87,15 +88,16 @@ class DistantMagnets:
         Args:
             model: The model.
             cells: All moments, with the cells of all bodies.
-            bodies: Few moments at the levels of a body by the index of a magnet.
+            bodies: Few moments at the levels of a body by the index of a magnet of ``cells.worlds``.
             settings, options: As of the system of ``cells``.
         """
         self._model, self._cells = model, cells
         count = max(len(levels) for levels in bodies.values())
         of_level = [{k: levels[min(level, len(levels) - 1)] for k, levels in bodies.items()} for level in range(count)]
-        self.levels = [PlacedMoments(model, _replaced(cells.magnets, few), settings, **options) for few in of_level]
-        worlds = np.array([magnet.world for magnet in cells.magnets])
-        self._choice = self._make_choice(np.isin(np.arange(len(self.converged)), worlds[list(bodies)]))
+        magnets = [_replaced(cells.worlds.magnets, few) for few in of_level]
+        self.levels = [PlacedMoments(model, replace(cells.worlds, magnets=few), settings, **options) for few in magnets]
+        in_copy = np.isin(np.arange(cells.worlds.world_step), [cells.worlds.magnets[k].world for k in bodies])
+        self._choice = self._make_choice(np.tile(in_copy, cells.worlds.copies))
         tables = [self._on_device(few, placed, bodies) for few, placed in zip(of_level, self.levels, strict=True)]
         arrays = [self._arrays(number, placed, bodies) for number, placed in enumerate((*self.levels, cells))]
         self._launches = DistantLaunches(tables, self._choice, cells.table, arrays)
@@ -123,6 +125,11 @@ class DistantMagnets:
     def _put(self, values, dtype) -> wp.array:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self._model.device)
 
+    def _put_copies(self, values, dtype, step=0) -> wp.array:
+        """Return the values of a copy of the worlds, and of all other copies, on the device."""
+        values = np.asarray(values, float if dtype == wp.vec3 else np.int32)
+        return put_copies(values, dtype, self._model.device, self._cells.worlds.copies, step)
+
     def _make_choice(self, has_bodies: np.ndarray) -> WorldChoice:
         choice, worlds, count = WorldChoice(), len(has_bodies), len(self.levels)
         choice.level = self._put(np.full(worlds, count), wp.int32)
@@ -135,53 +142,69 @@ class DistantMagnets:
         self, bodies: dict[int, DistantBody], placed: PlacedMoments, levels: dict[int, list[DistantBody]]
     ) -> DistantBodies:
         """Return the tables of bodies with few moments at one of their levels, the moments ``placed``."""
-        arrays, first, magnets, put = DistantBodies(), placed.first, self._cells.magnets, self._put
-        indices, records = list(bodies), list(bodies.values())
-        worlds = np.array([magnet.world for magnet in magnets])
-        ranges = np.array(placed.system.world_ranges)[worlds[indices]]
-        arrays.body = put([magnets[k].body for k in indices], wp.int32)
-        arrays.world = put(worlds[indices], wp.int32)
-        arrays.own = put([(first[k], first[k + 1]) for k in indices], wp.vec2i)
-        arrays.sources = put(ranges[:, [0, 2]], wp.vec2i)
+        arrays, first, cells, put = DistantBodies(), placed.first, self._cells, self._put_copies
+        indices, records, equal = list(bodies), list(bodies.values()), cells.worlds
+        magnets, moments = equal.magnets, int(first[len(equal.magnets)])  # moments of a copy
+        worlds = np.array([magnets[k].world for k in indices])
+        ranges = np.array(placed.system.world_ranges[: equal.world_step])[worlds]
+        arrays.body = put([magnets[k].body for k in indices], wp.int32, equal.body_step)
+        arrays.world = put(worlds, wp.int32, equal.world_step)
+        arrays.own = put([(first[k], first[k + 1]) for k in indices], wp.vec2i, moments)
+        arrays.sources = put(ranges[:, [0, 2]], wp.vec2i, moments)
         arrays.lower, arrays.upper = (put([getattr(b, name) for b in records], wp.vec3) for name in ("lower", "upper"))
         reaches = np.full((len(indices), len(self.levels)), np.inf)
         for row, k in enumerate(indices):
             reaches[row, : len(levels[k])] = [body.reach for body in levels[k]]
-        arrays.reach = put(reaches, float)
+        arrays.reach = self._put(np.tile(reaches, (equal.copies, 1)), float)
+        self._put_patterns(arrays, records)
+        coupled = [k for k, magnet in enumerate(magnets) if magnet.lattice.coupling is not None]
+        arrays.rotation = put(np.searchsorted(coupled, indices), wp.int32, len(coupled))
+        self._put_matches(arrays, first[: len(magnets) + 1], indices)
+        arrays.moment_world = cells.system.world_of_moments
+        return arrays
+
+    def _put_patterns(self, arrays: DistantBodies, records: list[DistantBody]) -> None:
+        """Set the patterns of the magnetization in the cells of bodies, and their coefficients."""
         shapes = {id(body): body for body in records}
         counts = np.array([(body.coefficients.size, body.patterns.size) for body in shapes.values()])
         begin = dict(zip(shapes, (np.cumsum(counts, axis=0) - counts).tolist(), strict=True))
-        arrays.table = put([(*begin[id(body)], body.patterns.shape[2]) for body in records], wp.vec3i)
-        arrays.coefficients = put(np.concatenate([body.coefficients.ravel() for body in shapes.values()]), float)
-        arrays.patterns = put(np.concatenate([body.patterns.ravel() for body in shapes.values()]), float)
+        arrays.table = self._put_copies([(*begin[id(body)], body.patterns.shape[2]) for body in records], wp.vec3i)
+        arrays.coefficients = self._put(np.concatenate([body.coefficients.ravel() for body in shapes.values()]), float)
+        arrays.patterns = self._put(np.concatenate([body.patterns.ravel() for body in shapes.values()]), float)
         pattern_counts = [body.patterns.shape[1] for body in records]
-        arrays.pattern_count = put(pattern_counts, wp.int32)
-        arrays.strengths = wp.zeros((len(records), max(pattern_counts)), dtype=float, device=self._model.device)
-        many = self._cells
-        numbers = np.full(len(magnets), -1, np.int32)
+        arrays.pattern_count = self._put_copies(pattern_counts, wp.int32)
+        count = self._cells.worlds.copies * len(records)
+        arrays.strengths = wp.zeros((count, max(pattern_counts)), dtype=float, device=self._model.device)
+
+    def _put_matches(self, arrays: DistantBodies, few: np.ndarray, indices: list[int]) -> None:
+        """Set the moments of the cells' system that stand for few moments, and the other way round.
+
+        ``few`` is the first of the few moments of each magnet of a copy, and the end; ``indices`` are the magnets of
+        the bodies.
+        """
+        cells = self._cells.first[: len(few)]
+        numbers = np.full(len(few) - 1, -1)
         numbers[indices] = np.arange(len(indices))
-        counts = np.diff(many.first)
-        within = np.arange(many.first[-1], dtype=np.int32) - np.repeat(many.first[:-1].astype(np.int32), counts)
+        counts = np.diff(cells)
+        within = np.arange(cells[-1]) - np.repeat(cells[:-1], counts)
         number = np.repeat(numbers, counts)
-        source = np.where(number < 0, np.repeat(first[:-1].astype(np.int32), counts) + within, np.int32(-1))
-        cell = np.stack([number, np.where(number < 0, np.int32(-1), within)], axis=1)
-        coupled = [k for k, magnet in enumerate(many.magnets) if magnet.lattice.coupling is not None]
-        arrays.rotation = put(np.searchsorted(coupled, indices), wp.int32)
-        arrays.same = put(_matching_moments(first, many.first), wp.int32)
-        arrays.source, arrays.cell = put(source, wp.int32), put(cell, wp.vec2i)
-        arrays.moment_world = put(many.system.worlds, wp.int32)
-        return arrays
+        source = np.where(number < 0, np.repeat(few[:-1], counts) + within, -1)
+        cell = np.stack([number, np.where(number < 0, -1, within)], axis=1)
+        arrays.same = self._put_copies(_matching_moments(few, cells), wp.int32, int(cells[-1]))
+        arrays.source = self._put_copies(source, wp.int32, int(few[-1]))
+        arrays.cell = self._put_copies(cell, wp.vec2i, [len(indices), 0])
 
     def _arrays(self, number: int, placed: PlacedMoments, bodies: dict[int, list[DistantBody]]) -> SystemArrays:
         """Return the arrays of a system, as kernels take them."""
-        arrays, system, counts = SystemArrays(), placed.system, np.diff(placed.first)
+        arrays, system, worlds = SystemArrays(), placed.system, placed.worlds
         names = ("resting", "positions", "radii", "moments", "external_field", "rotations")
         for name in (*names, "error", "residual", "evaluations", "converged"):
             setattr(arrays, name, getattr(system, name))
         arrays.number, arrays.begins = number, wp.zeros_like(system.resting)
-        replaced = np.repeat([k in bodies for k in range(len(counts))], counts)
+        replaced = [magnet.world if k in bodies else -1 for k, magnet in enumerate(worlds.magnets)]
+        counts = np.diff(placed.first[: len(replaced) + 1])
         arrays.saturation, arrays.volumes = system.material.saturation, placed.table.volumes
-        arrays.replaced = self._put(np.where(replaced, system.worlds, -1), wp.int32)
+        arrays.replaced = self._put_copies(np.repeat(replaced, counts), wp.int32, worlds.world_step)
         return arrays
 
     def gather(self, body_q: wp.array, values: ModelValues) -> None:

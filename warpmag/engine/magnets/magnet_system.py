@@ -4,6 +4,7 @@ import newton
 import numpy as np
 
 from warpmag.declarations.magnets import LINEAR_CURVE, MagneticSettings
+from warpmag.engine.magnets.equal_worlds import EqualWorlds, kinematic_bodies
 from warpmag.engine.magnets.grouping import BodyMagnet
 from warpmag.kernels.applied.solids import SolidMagnet
 from warpmag.kernels.near_contact.images import IronFaces
@@ -11,17 +12,16 @@ from warpmag.moments.layout import MomentMaterial
 from warpmag.moments.settings import SolverSettings
 from warpmag.moments.system import MomentSystem
 
-KINEMATIC = int(newton.BodyFlags.KINEMATIC)
-
 
 def make_system(
-    model: newton.Model, magnets: list[BodyMagnet], settings: MagneticSettings, *, curve, sources, **options
-) -> tuple[MomentSystem, list[int], list[int]]:
-    """Return the system of the moments of all magnets of a model, and the bodies of its couplings and of its solids.
+    model: newton.Model, worlds: EqualWorlds, settings: MagneticSettings, *, curve, sources, **options
+) -> MomentSystem:
+    """Return the system of the moments of all magnets of a model.
 
     ``curve`` replaces the curves of all inducible magnets; None keeps them. See :class:`MomentSystem` for
     ``sources``, and :class:`SolverSettings` for further ``options``.
     """
+    magnets = worlds.magnets
     counts = [len(magnet.lattice.volumes) for magnet in magnets]
 
     def per_moment(values, dtype=float):
@@ -30,19 +30,18 @@ def make_system(
     first = (np.cumsum(counts) - counts).tolist()
     coupled = [(k, magnet) for k, magnet in zip(first, magnets, strict=True) if magnet.lattice.coupling is not None]
     materials = [magnet.magnet for magnet in magnets]
-    flags = model.body_flags  # None in a model without bodies
-    kinematic = [] if flags is None else ((flags.numpy() & KINEMATIC) != 0).tolist()
-    # each static magnet counts as a body, numbered after the bodies of the model
+    # each static magnet of a world counts as a body, numbered after the bodies of the model
     static = np.cumsum([magnet.body < 0 for magnet in magnets]) + model.body_count
     bodies = [magnet.body if magnet.body >= 0 else k for magnet, k in zip(magnets, static.tolist(), strict=True)]
+    kinematic = kinematic_bodies(model).tolist()
     movable = [magnet.body >= 0 and not kinematic[magnet.body] for magnet in magnets]
     solids = [
-        (magnet.body, _solid_magnet(k, magnet, can_move, part))
+        _solid_magnet(k, magnet, can_move, part)
         for k, magnet, can_move in zip(first, magnets, movable, strict=True)
         for part in magnet.lattice.solids
     ]
     curves = [LINEAR_CURVE if material.recoils else curve or material.curve for material in materials]
-    system = MomentSystem(
+    return MomentSystem(
         worlds=per_moment([magnet.world for magnet in magnets], int),
         permanent=per_moment([material.fixed for material in materials], bool),
         radii=np.concatenate([magnet.lattice.radii for magnet in magnets]),
@@ -59,13 +58,14 @@ def make_system(
             settings.force, settings.dynamics, settings.contact_model, rtol=settings.rtol, **options
         ),
         couplings=[(k, magnet.lattice.coupling) for k, magnet in coupled],
-        solids=[solid for _, solid in solids],
+        solids=solids,
         faces=[_iron_faces(number, k, magnet) for number, (k, magnet) in enumerate(coupled) if _has_faces(magnet)],
+        copies=worlds.copies,
+        body_step=worlds.body_step,
         body_extent=_largest_extent(magnets, np.array(bodies), np.array(movable)),
         sources=sources,
         device=model.device,
     )
-    return system, [magnet.body for _, magnet in coupled], [body for body, _ in solids]
 
 
 def _has_faces(magnet: BodyMagnet) -> bool:

@@ -18,6 +18,7 @@ from warpmag.engine.magnets.caller_checks import check_duration, check_state, he
 from warpmag.engine.magnets.caller_values import device_vectors, world_indices
 from warpmag.engine.magnets.distant_magnets import DistantMagnets, distant_bodies
 from warpmag.engine.magnets.eddy import gather_velocities, set_conductivities
+from warpmag.engine.magnets.equal_worlds import equal_worlds
 from warpmag.engine.magnets.grouping import BodyMagnet, find_magnets
 from warpmag.engine.magnets.imported_field import imported_field
 from warpmag.engine.magnets.model_values import ModelValues, magnetic_arrays
@@ -32,6 +33,7 @@ from warpmag.kernels.rigid.bodies import (
     set_external_field,
     set_magnetization,
 )
+from warpmag.kernels.rigid.worlds import number_worlds
 from warpmag.moments.arrays import (
     CallContext,
     Numbers,
@@ -144,20 +146,21 @@ class Magnetics:
         self._induced = False
         options = {"sources": self._sources.applied, "curve": curve, "method": method}
         options["max_evaluations"] = max_evaluations
-        self._placed = placed = PlacedMoments(model, self.magnets, settings, **options)
+        worlds = equal_worlds(model, self.magnets)
+        self._placed = placed = PlacedMoments(model, worlds, settings, **options)
         self.system, self._distant = placed.system, None
-        bodies = distant_bodies(model, self.magnets, settings, method=method, has_sources=bool(self._sources.applied))
+        bodies = distant_bodies(model, worlds.magnets, settings, method=method, has_sources=bool(self._sources.applied))
         if bodies:
             self._distant = DistantMagnets(model, placed, bodies, settings, **options)
         self._sources.bind(self.system)
         self.coils = self._sources.circuits
-        self._shape_moments = ShapeMoments(model, self.magnets, placed.volumes)
+        self._shape_moments = ShapeMoments(model, worlds)
         self.shapes, self.shape_volumes = self._shape_moments.shapes, self._shape_moments.volumes
         self._permanent_shapes = PermanentShapes(model, self.magnets)
-        newton_worlds = np.maximum(self._worlds, 0)[self.system.worlds]
-        self._newton_world = wp.array(newton_worlds, dtype=wp.int32, device=model.device)
+        newton_worlds = wp.array(self._worlds, dtype=wp.int32, device=model.device)
+        self._newton_world = number_worlds(newton_worlds, self.system.world_of_moments)
         self._gradients = ForceGradients(placed, self._sources, model)
-        self._start = WorldStart(model, self._worlds, self.system)
+        self._start = WorldStart(model, newton_worlds, self.external_field, self._newton_world)
         set_conductivities(model, self.magnets, self.system, float(dt))
         if imported is not None:
             self.set_external_field(imported)

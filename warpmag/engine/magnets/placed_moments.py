@@ -5,9 +5,10 @@ import numpy as np
 import warp as wp
 
 from warpmag.declarations.attributes import NAMESPACE
-from warpmag.engine.magnets.grouping import BodyMagnet
-from warpmag.engine.magnets.magnet_system import KINEMATIC, make_system
+from warpmag.engine.magnets.equal_worlds import KINEMATIC, EqualWorlds
+from warpmag.engine.magnets.magnet_system import make_system
 from warpmag.engine.magnets.model_values import ModelValues
+from warpmag.engine.magnets.sampling import BodyLattice
 from warpmag.kernels.rigid.bodies import (
     BodyMoments,
     add_wrenches,
@@ -16,59 +17,73 @@ from warpmag.kernels.rigid.bodies import (
     gather_moments,
     gather_rotations,
 )
+from warpmag.kernels.shared.copies import put_copies
 
 
 class PlacedMoments:
     """The moments of magnets, fixed to the bodies of a model.
 
     Attributes:
-        magnets: The magnets, in the order of their moments.
+        worlds: The magnets, in the order of their moments.
         system: The moments on the device.
         table: The moments and their bodies, as kernels read them.
         first: First moment of each magnet, and the end, shape [magnets + 1].
-        volumes: Volume of each moment [m³], shape [n].
         recoiling: Moments with recoil permeability, on the device.
         coupled_bodies: Body of each magnet of cells, in the order of ``system.rotations``, on the device.
         solid_bodies: Body of each permanent part with a closed form, in the order of ``system.sources.solid_frames``.
     """
 
-    def __init__(self, model: newton.Model, magnets: list[BodyMagnet], settings, **options):
-        """Make the system of the moments of ``magnets``; see :func:`make_system` for the other arguments."""
-        self.magnets, device = magnets, model.device
-        self.system, coupled_bodies, solid_bodies = make_system(model, magnets, settings, **options)
-
-        def put(values, dtype):
-            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
-
-        lattices, materials = [magnet.lattice for magnet in magnets], [magnet.magnet for magnet in magnets]
+    def __init__(self, model: newton.Model, worlds: EqualWorlds, settings, **options):
+        """Make the system of the moments of all magnets; see :func:`make_system` for the other arguments."""
+        self.worlds, self._device = worlds, model.device
+        self.system = make_system(model, worlds, settings, **options)
+        lattices = [magnet.lattice for magnet in worlds.magnets]
         counts = [len(lattice.volumes) for lattice in lattices]
-        run_body = np.array([magnet.body for magnet in magnets])
-        self.volumes = np.concatenate([lattice.volumes for lattice in lattices])
-        self.first = start = np.concatenate([[0], np.cumsum(counts)])
+        starts = np.cumsum([0, *counts])
+        self.first = np.append(worlds.of_magnets(starts[:-1], starts[-1]), worlds.copies * starts[-1])
+        self.table = self._make_table(model, lattices, counts)
+        coupled = [magnet.body for magnet in worlds.magnets if magnet.lattice.coupling is not None]
+        solid = [magnet.body for magnet in worlds.magnets for _ in magnet.lattice.solids]
+        self.coupled_bodies, self.solid_bodies = (
+            self._put(bodies, wp.int32, step=worlds.body_step) for bodies in (coupled, solid)
+        )
+        materials = [magnet.magnet for magnet in worlds.magnets]
+        recoiling = np.flatnonzero(np.repeat([material.recoils for material in materials], counts))
+        susceptibility = np.repeat([material.recoil_permeability - 1.0 for material in materials], counts)
+        self.recoiling = self._put(recoiling, wp.int32, step=int(starts[-1]))
+        self._bias_factors = self._put(1.0 / susceptibility[recoiling], wp.float32)
+
+    def _put(self, values, kind, *, step=0) -> wp.array:
+        """Return copies of values of one copy on the device."""
+        if kind == wp.int32:
+            values = np.asarray(values, np.int32)
+        return put_copies(values, kind, self._device, self.worlds.copies, step)
+
+    def _make_table(self, model: newton.Model, lattices: list[BodyLattice], counts: list[int]) -> BodyMoments:
+        """Return the moments and their bodies, with the runs of moments of each body."""
+        magnets, worlds, moments = self.worlds.magnets, self.worlds, BodyMoments()
         shapes = [shape for magnet in magnets for shape in magnet.shapes]
         shape_counts = np.concatenate([lattice.counts for lattice in lattices])
-
-        self.table = moments = BodyMoments()
-        moments.body = put(np.repeat(run_body, counts), wp.int32)
-        moments.permanent = put(np.repeat([material.fixed for material in materials], counts), wp.bool)
-        moments.local_positions = put(np.concatenate([lattice.positions for lattice in lattices]), wp.vec3)
-        moments.volumes, moments.shape = put(self.volumes, float), put(np.repeat(shapes, shape_counts), wp.int32)
+        bodies = np.repeat([magnet.body for magnet in magnets], counts)
+        moments.body = self._put(bodies, wp.int32, step=worlds.body_step)
+        moments.permanent = self._put(np.repeat([magnet.magnet.fixed for magnet in magnets], counts), wp.bool)
+        moments.local_positions = self._put(np.concatenate([lattice.positions for lattice in lattices]), wp.vec3)
+        moments.volumes = self._put(np.concatenate([lattice.volumes for lattice in lattices]), wp.float32)
+        moments.shape = self._put(np.repeat(shapes, shape_counts), wp.int32, step=worlds.shape_step)
         moments.shape_frames = model.shape_transform
         moments.magnetizations = getattr(model, NAMESPACE).magnetization
-        moments.kinematic_flag = KINEMATIC
+        moments.kinematic_flag, moments.resting = KINEMATIC, self.system.resting
+        run_body = worlds.bodies()
         order = np.argsort(run_body, kind="stable")
         bodies, first = np.unique(run_body[order], return_index=True)
         dynamic = bodies >= 0
-        worlds = np.array([magnet.world for magnet in magnets])[order][first]
-        moments.body_list, moments.body_world = put(bodies[dynamic], wp.int32), put(worlds[dynamic], wp.int32)
-        moments.body_run_start = put(np.append(first[dynamic], len(order)), wp.int32)
-        moments.runs = put(np.stack([start[:-1], start[1:]], axis=1)[order], wp.vec2i)
-        moments.resting = self.system.resting
-
-        self.coupled_bodies, self.solid_bodies = put(coupled_bodies, wp.int32), put(solid_bodies, wp.int32)
-        susceptibility = np.repeat([material.recoil_permeability - 1.0 for material in materials], counts)
-        recoiling = np.flatnonzero(np.repeat([material.recoils for material in materials], counts))
-        self.recoiling, self._bias_factors = put(recoiling, wp.int32), put(1.0 / susceptibility[recoiling], float)
+        body_world = worlds.world_numbers()[order][first][dynamic]
+        run_start, runs = np.append(first[dynamic], len(order)), np.stack([self.first[:-1], self.first[1:]], axis=1)
+        moments.body_list, moments.body_world, moments.body_run_start = (
+            wp.array(values, dtype=wp.int32, device=self._device) for values in (bodies[dynamic], body_world, run_start)
+        )
+        moments.runs = wp.array(runs[order].astype(np.int32), dtype=wp.vec2i, device=self._device)
+        return moments
 
     def gather(self, body_q: wp.array, values: ModelValues) -> None:
         """Write positions, rotations and permanent moments at the poses ``body_q`` to the system."""

@@ -60,7 +60,8 @@ class ForceGradients:
         """Prepare the gradients of the moments ``placed`` and the coils ``sources`` of a model."""
         self._system, self._magnets, self._sources, self._model = placed.system, placed.table, sources, model
         self._placed = placed
-        iron = [magnet.body for magnet in placed.magnets if magnet.magnet.kind == "inducible" and magnet.body >= 0]
+        magnets = placed.worlds.magnets
+        iron = [magnet.body for magnet in magnets if magnet.magnet.kind == "inducible" and magnet.body >= 0]
         self._shares_body = bool(np.isin(iron, placed.solid_bodies.numpy()).any())
 
     def arguments(self, state) -> dict[str, wp.array]:

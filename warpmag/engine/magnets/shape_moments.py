@@ -7,9 +7,11 @@ import numpy as np
 import warp as wp
 
 from warpmag.declarations.checks import check_vector, check_whole, short_repr
+from warpmag.engine.magnets.equal_worlds import EqualWorlds
 from warpmag.engine.magnets.grouping import BodyMagnet
 from warpmag.errors import InputError
 from warpmag.kernels.rigid.bodies import sum_moments
+from warpmag.kernels.shared.copies import repeat_rows
 
 
 def _on_device(values: np.ndarray, model: newton.Model) -> wp.array:
@@ -24,12 +26,15 @@ class ShapeMoments:
         volumes: Magnetic volume of each shape [m³], NumPy, shape [n].
     """
 
-    def __init__(self, model: newton.Model, magnets: list[BodyMagnet], volumes: np.ndarray):
-        """Find the moments of the shapes of ``magnets``; ``volumes`` are those of moments [m³], shape [moments]."""
-        self.shapes = np.concatenate([magnet.shapes for magnet in magnets])
+    def __init__(self, model: newton.Model, worlds: EqualWorlds):
+        """Find the moments of the shapes of all magnets."""
+        magnets, copies = worlds.magnets, worlds.copies
+        self.shapes = repeat_rows(np.concatenate([magnet.shapes for magnet in magnets]), copies, worlds.shape_step)
         counts = np.concatenate([magnet.lattice.counts for magnet in magnets])
-        self._first = np.concatenate([[0], np.cumsum(counts)])
-        self.volumes = np.diff(np.concatenate([[0.0], np.cumsum(volumes)])[self._first])
+        volumes = np.concatenate([magnet.lattice.volumes for magnet in magnets])
+        self._first = np.cumsum([0, *repeat_rows(counts, copies)])
+        ends = self._first[: len(counts) + 1]
+        self.volumes = repeat_rows(np.diff(np.concatenate([[0.0], np.cumsum(volumes)])[ends]), copies)
         self._first_on_device = _on_device(self._first, model)
         self._totals = wp.zeros(len(self.shapes), dtype=wp.vec3, device=model.device)
 

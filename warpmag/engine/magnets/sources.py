@@ -11,7 +11,7 @@ from warpmag.declarations.attributes import NAMESPACE
 from warpmag.declarations.checks import check_whole, short_repr
 from warpmag.declarations.coils import SourceRecord, check_strength
 from warpmag.engine.magnets.circuits import CoilCircuits
-from warpmag.engine.magnets.magnet_system import KINEMATIC
+from warpmag.engine.magnets.equal_worlds import KINEMATIC
 from warpmag.errors import InputError
 from warpmag.kernels.applied.sources import AppliedSource, SourceKind
 from warpmag.kernels.rigid.sources import (

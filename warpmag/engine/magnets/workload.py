@@ -57,11 +57,9 @@ class Workload:
 
 def workload(magnetics, placed: PlacedMoments) -> Workload:
     """Return the workload of the last solve of the moments ``placed``; see :meth:`Magnetics.workload`."""
-    system, magnets = placed.system, placed.magnets
-    counts = np.array([len(magnet.lattice.volumes) for magnet in magnets])
-    worlds = np.array([magnet.world for magnet in magnets])
-    firsts = np.cumsum(counts) - counts
-    near = np.add.reduceat(near_cells(system), firsts)
+    system, magnets = placed.system, magnetics.magnets
+    counts, worlds = np.diff(placed.first), placed.worlds.world_numbers()
+    near = np.add.reduceat(near_cells(system), placed.first[:-1])
     evaluations, seconds = system.evaluations.numpy(), part_times(system)
     in_world = np.bincount(worlds, counts)
     shares = {

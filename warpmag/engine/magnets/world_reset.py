@@ -12,7 +12,6 @@ from warpmag.declarations.checks import short_repr
 from warpmag.errors import InputError
 from warpmag.kernels.rigid.worlds import choose, complete_mask, restore_rows
 from warpmag.moments.arrays import check_warp_array
-from warpmag.moments.system import MomentSystem
 
 
 class WorldMask:
@@ -74,11 +73,15 @@ def _from_dlpack(tensor: Any) -> wp.array:
 class WorldRows:
     """An array over the objects of a model, and a copy of it from which the rows of worlds return."""
 
-    def __init__(self, array: wp.array, worlds: npt.ArrayLike):
-        """Copy the values of a contiguous array; ``worlds`` are its rows' worlds, -1 for outside all, shape [rows]."""
+    def __init__(self, array: wp.array, worlds: npt.ArrayLike | wp.array):
+        """Copy the values of a contiguous array.
+
+        ``worlds`` are the worlds of its rows, -1 for outside all, shape [rows]. A Warp array is not copied.
+        """
         self._rows = _bytes_of(array)
         self._saved = wp.clone(self._rows)
-        self._worlds = wp.array(worlds, dtype=wp.int32, device=array.device)
+        on_device = isinstance(worlds, wp.array)
+        self._worlds = worlds if on_device else wp.array(worlds, dtype=wp.int32, device=array.device)
         self._array = array  # ``_rows`` is a view of its memory
 
     def restore(self, mask: WorldMask) -> None:
@@ -89,17 +92,24 @@ class WorldRows:
 class WorldStart:
     """Values of the magnets of a model that return where worlds start again."""
 
-    def __init__(self, model: newton.Model, worlds: np.ndarray, system: MomentSystem):
-        """Copy the present values; ``worlds`` are Newton's numbers of the worlds of ``system``."""
+    def __init__(self, model: newton.Model, worlds: wp.array, external_field: wp.array, moment_worlds: wp.array):
+        """Copy the present values.
+
+        Args:
+            model: The model.
+            worlds: Newton's numbers of the worlds with magnets, on the device.
+            external_field: External field of each moment.
+            moment_worlds: Newton's number of each moment's world, on the device.
+        """
         attributes, shape_worlds = getattr(model, NAMESPACE), model.shape_world.numpy()[: model.shape_count]
         self._mask = WorldMask(model)
-        self._worlds = wp.array(worlds, dtype=wp.int32, device=model.device)
+        self._worlds = worlds
         self._chosen = wp.zeros_like(self._worlds)
         self._values = [
             WorldRows(attributes.magnetization, shape_worlds),
             WorldRows(attributes.strength, shape_worlds),
             WorldRows(attributes.voltage, shape_worlds),
-            WorldRows(system.external_field, worlds[system.worlds]),
+            WorldRows(external_field, moment_worlds),
         ]
 
     def restore(self, worlds: Any) -> tuple[WorldMask, wp.array]:
