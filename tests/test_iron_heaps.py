@@ -18,6 +18,14 @@ def test_heaps_are_stable_and_balanced(device):
     assert np.median(sums) < 3e-7 and np.quantile(sums, 0.8) < 1e-6
 
 
+def test_sweeps_that_diverge_end(device):
+    """Of cells in two balls that overlap: plain steps converge in 45 evaluations. With each second one it took 797."""
+    number = 643
+    heap = heaps.draw(number // heaps.BATCH, 7)[number % heaps.BATCH]
+    (verdict,) = heaps.SolvedHeaps([heap], device).verdicts(number)
+    assert verdict.passes and verdict.evaluations < 200
+
+
 SHEETS = {
     "inside": [((0.024, 0.024, 0.003), 0.0025, (0.0, 0.0, 0.0)), ((0.024, 0.024, 0.001), 0.0018, (0.0, 0.0, 0.0))],
     "turned": [((0.024, 0.024, 0.0005), 0.0022, (0.0, 0.0, 0.0)), ((0.024, 0.024, 0.0005), 0.0022, (0.0, 0.0, 0.3))],

@@ -26,7 +26,7 @@ follow each step. Here ḡ = s̄ + r̄, and ω' is a little above ω. In cold st
 to 10 evaluations to 1e-3, and more where balls overlap.
 
 A step with mixing or sweeps is rejected if it leaves the merit ‖φ r‖ more than twice the best. A few plain steps from
-the best iterate follow.
+the best iterate follow, and no more sweeps: where balls overlap cells, sweeps can diverge.
 
 **Result and error.** The last residual allows one more step. A solve returns M and H of s̄ + ω₁ r̄, with M = f(H). The
 whole step ω₁ is 1, which solves an isolated ball, or less where balls overlap. The part of r that the mixture removes

@@ -6,7 +6,7 @@
 namespace warpmag {
 
 constexpr int PLAIN_STEPS = DEPTH + 1; // plain steps after an accelerated step was rejected
-constexpr int APART = 32;              // solves without steps of bodies as a whole after a step was rejected
+constexpr int APART = 32;              // solves without sweeps and steps of bodies as a whole after a rejection
 constexpr double WHOLE_STEP = 0.6;     // step length of balls without overlap
 constexpr double SLOWEST = 20.0;       // largest error amplification by slow convergence
 constexpr double LEAST = 0.01;         // lower bound of an error, as a fraction of the last change
@@ -121,7 +121,7 @@ template <class State> CUDA_CALLABLE inline void choose_step(State& state, int w
         world.ahead = followed < 0.0 ? 0.0 : followed > 1.0 ? 1.0 : followed;
     }
     world.changes_mixture = world.has_change && world.is_best && is_long(world);
-    int next = done || world.plain_steps > 0 ? STEP : STEP_AND_SWEEP;
+    int next = done || world.plain_steps > 0 || world.apart > 0 ? STEP : STEP_AND_SWEEP;
     if (!mixed) next = STEP_FROM_BEST;
     if (done && !finite) next = NOTHING;
     if (no_field && !done) next = DEMAGNETIZE;
