@@ -55,8 +55,8 @@ CUDA_CALLABLE inline int increment(int* count) {
 }
 
 // Kinds of candidates, in the order of a row, so that vectors of rows have few different ones in a slot. Differences
-// act between the first two, the others are too far for their longest sides.
-enum CandidateKind { CLOSE_NOW, MAY_BE_CLOSE, CLOSE_AND_FLAT, NEAR_NOW, MAY_BE_NEAR, KINDS };
+// act between the first three, the others are too far for their longest sides. The first ones have fine points.
+enum CandidateKind { FINE_NOW, CLOSE_NOW, MAY_BE_CLOSE, CLOSE_AND_FLAT, NEAR_NOW, MAY_BE_NEAR, KINDS };
 
 template <class Pairs> CUDA_CALLABLE inline int kind_of(const Pairs& a, int i, int j) {
     const Real *const own = a.box.data + LINE * (size_t)i, *const other = a.box.data + LINE * (size_t)j;
@@ -65,7 +65,8 @@ template <class Pairs> CUDA_CALLABLE inline int kind_of(const Pairs& a, int i, i
     const Real d2 = r[0] * r[0] + r[1] * r[1] + r[2] * r[2];
     const Real size = (own[7] + other[7]) / 2, d = (CLOSE_END + MARGIN) * (longest_half(own) + longest_half(other));
     const bool close = d2 < CLOSE_END * size * CLOSE_END * size;
-    if (d2 < d * d) return close ? CLOSE_NOW : MAY_BE_CLOSE;
+    const bool flat = own[14] >= 2 || other[14] >= 2, fine = flat && d2 < FINE_END * size * FINE_END * size;
+    if (d2 < d * d) return fine ? FINE_NOW : close ? CLOSE_NOW : MAY_BE_CLOSE;
     return close ? CLOSE_AND_FLAT : d2 < WINDOW_END * size * WINDOW_END * size ? NEAR_NOW : MAY_BE_NEAR;
 }
 
@@ -86,9 +87,9 @@ template <class Pairs> CUDA_CALLABLE inline void select(const Pairs& a, int i) {
     for (int n = 0; n < KINDS; ++n) kinds[n] = group_count(kinds[n]);
     if (share() != 0) return;
     for (int n = 0; n < KINDS; ++n) a.kinds.data[KINDS * (size_t)i + n] = kinds[n];
-    const int close = kinds[CLOSE_NOW] + kinds[MAY_BE_CLOSE];
+    const int now = kinds[FINE_NOW] + kinds[CLOSE_NOW], close = now + kinds[MAY_BE_CLOSE];
     if (close > a.close_capacity && a.close_capacity > 0) raise_flag(*a.crowded.data);
-    a.bin.data[i] = CLASSES * class_of((kinds[CLOSE_NOW] + 1) / 2) + class_of(count / 16);
+    a.bin.data[i] = CLASSES * class_of((now + 1) / 2) + class_of(count / 16);
     increment(a.bin_end.data + a.bin.data[i]);
 }
 
@@ -156,7 +157,7 @@ template <class Pairs> struct Rows {
         int close[WIDTH];
         for (int l = 0; l < WIDTH; ++l) {
             const int* const kinds = a.kinds.data + KINDS * (size_t)own.at[l];
-            close[l] = counts[l] == 0 ? 0 : kinds[CLOSE_NOW] + kinds[MAY_BE_CLOSE];
+            close[l] = counts[l] == 0 ? 0 : kinds[FINE_NOW] + kinds[CLOSE_NOW] + kinds[MAY_BE_CLOSE];
         }
         return largest_count(close);
     }

@@ -63,7 +63,7 @@ LOCATE, CLEAR, SELECT, ARRANGE, ASSIGN, TABULATE, TAKE_BALLS, ADD_FIELD, ADD_FOR
 """The passes, in order; as in ``cell_pairs.h``."""
 _MATRIX_ROWS, _DETAIL_ROWS, _POSE_ROWS = 9, 27, 7
 """Numbers of the matrices of a pair and of a relative pose; as in ``cell_pairs.h``."""
-_KINDS = 5
+_KINDS = 6
 """Kinds of candidates; as in ``cell_pairs.h``."""
 _BINS = 256
 """Bins of rows by their numbers of candidates; as in ``cell_pairs.h``."""
