@@ -12,8 +12,8 @@ import warp as wp
 import warpmag
 from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.engine.pile_xpbd.contacts import RigidSolver, body_sizes
+from warpmag.engine.stepping.held_bodies import find_held
 from warpmag.engine.stepping.simulation import Simulation
-from warpmag.engine.stepping.statistics import find_held
 from warpmag.engine.stepping.stepper import OVERLAP_LIMIT, TRAVEL_LIMIT, Stepper
 from warpmag.kernels.rigid.monitor import UNCONSTRAINED_WEIGHT
 from warpmag.kernels.shared.scan import launch_scan

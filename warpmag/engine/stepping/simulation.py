@@ -1,9 +1,7 @@
 """Simulates a scene with magnets, from a USD stage or a Newton builder."""
 
-import contextlib
 import math
 import os
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -15,23 +13,20 @@ import warp as wp
 from warpmag.declarations.checks import check_count, check_flag, check_positive, short_repr
 from warpmag.declarations.magnets import MagneticSettings
 from warpmag.deprecation import renamed_arguments
-from warpmag.engine.magnets.attributes import NAMESPACE
 from warpmag.engine.magnets.caller_checks import check_control
 from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.engine.magnets.workload import moments_line
 from warpmag.engine.pile_xpbd.contacts import RigidSolver, body_sizes
 from warpmag.engine.pile_xpbd.solvers import SOLVERS, check_solver
+from warpmag.engine.stepping.failure_cause import failure_cause
+from warpmag.engine.stepping.frame_run import run_frames
+from warpmag.engine.stepping.held_bodies import held_bodies
 from warpmag.engine.stepping.keyed_values import KeyedModelValues
-from warpmag.engine.stepping.model_checks import (
-    articulate,
-    check_stability,
-    joint_gap_warnings,
-    joint_gaps,
-)
-from warpmag.engine.stepping.statistics import Statistics, find_held
+from warpmag.engine.stepping.model_checks import joint_gap_warnings, joint_gaps
+from warpmag.engine.stepping.solver_model import position_coarseness, solver_model
+from warpmag.engine.stepping.statistics import Statistics
 from warpmag.engine.stepping.stepper import Stepper
 from warpmag.errors import InputError, SimulationError, warn_caller
-from warpmag.kernel_loading import kernel_seconds
 from warpmag.moments.arrays import resolve_device
 from warpmag.moments.ranks import current_ranks, errors_on_all_ranks
 from warpmag.terminal import collection_paused
@@ -42,19 +37,8 @@ LONGEST_SUBSTEP = 5e-4
 """Upper limit of a substep [s]. With it and XPBD's 60 iterations piles of 5 mm balls come to rest."""
 _OVERLAP = 1e-4
 """Ratio of the initial overlap to the thickness above which a warning is issued."""
-_TOUCHING = 0.05
-"""Largest ratio of gap to thickness of bodies that count as touching, for the number of held bodies."""
 _FRAME_RATE = 60.0
 """Output frame rate of a builder [Hz]."""
-_AHEAD = 16
-"""Steps queued on a GPU before the host writes the last frame. Launches block with about 20 queued steps."""
-_STRONGEST_FIELD = 1e8
-"""Field, magnetization [A/m] or current [A] above which an error names it as the cause: ten times practical maxima."""
-
-
-def _running_time() -> float:
-    """Return the time [s] of a clock that stands while kernels are compiled, if the command measures that."""
-    return time.perf_counter() - kernel_seconds()
 
 
 class Simulation:
@@ -156,7 +140,9 @@ class Simulation:
             time_step = next(value for value in (dt, scene_step, DEFAULT_STEP) if value is not None)
             check_positive("dt", time_step)
             self.step_size = float(time_step)
-            self.model = self._finalize(builder, solver, scene)
+            stage = "" if self._scene is None else str(scene)
+            self.model = solver_model(builder, solver, self.device, stage=stage, longest_substep=LONGEST_SUBSTEP)
+            self._joint_gaps = joint_gaps(self.model) if SOLVERS[solver].maximal else {}
             settings = settings.replaced(external_field=external_field, **overrides)
             magnetic = vars(settings) | ({"external_field": external_field} if self._scene is None else {})
             self._magnetics = Magnetics(self.model, dt=LONGEST_SUBSTEP, **solve_options, **magnetic)
@@ -190,27 +176,6 @@ class Simulation:
         options["external_field"] = tuple(np.asarray(settings.external_field, dtype=float).tolist())
         return {name.replace("_", " "): str(value) for name, value in options.items()}
 
-    def _finalize(self, builder: newton.ModelBuilder, solver: str, scene) -> newton.Model:
-        """Return the model of a builder, with the articulations and colors that the solver needs."""
-        articulate(builder, solver)
-        if not builder.body_count:  # Newton needs a body; one without shapes has no effect
-            extended = newton.ModelBuilder()
-            extended.add_builder(builder)
-            extended.add_link(is_kinematic=True)
-            builder = extended
-        if solver == "vbd":
-            builder.color()  # VBD moves bodies of one color at once
-        errors = contextlib.nullcontext()
-        if self._scene is not None:
-            from warpmag.usd import newton_errors  # noqa: PLC0415 - a builder can do without USD
-
-            errors = newton_errors(str(scene), "use")
-        with wp.ScopedDevice(self.device), errors:
-            model = builder.finalize(device=self.device, skip_validation_joints=SOLVERS[solver].maximal)
-        check_stability(model, solver, LONGEST_SUBSTEP)
-        self._joint_gaps = joint_gaps(model) if SOLVERS[solver].maximal else {}
-        return model
-
     def _keyed_values(self, solver: str, keyed_field: bool) -> KeyedModelValues | None:
         """Return the keyed values of the stage, with its external field if ``keyed_field``; None without keys."""
         if self._scene is None:
@@ -234,23 +199,7 @@ class Simulation:
         self._center = self._positions(self.state).mean(axis=0) if len(self._moving) else np.zeros(3)
         overlap, _, self._statistics.overlapping = self._stepper.measure_contacts(_OVERLAP)
         self._stepper.set_initial_overlap(overlap)
-        self._statistics.coarseness = self._coarseness(sizes.thickness)
-
-    def _coarseness(self, thickness: np.ndarray) -> float:
-        """Return the largest spacing of single-precision positions over the thickness [m] of a body.
-
-        Raises:
-            InputError: A body is so far from the origin that its position is unknown by more than its thickness.
-        """
-        spacings = np.spacing(np.abs(self.state.body_q.numpy()[:, :3]).max(axis=1, initial=0.0))
-        coarseness = spacings / thickness  # the thickness of fixed bodies is infinite
-        worst = int(np.argmax(coarseness)) if len(coarseness) else -1
-        if worst >= 0 and coarseness[worst] > 1.0:
-            raise InputError(
-                f"{self.model.body_label[worst]}: is too far from the origin: positions in single precision are "
-                f"{spacings[worst]:.2g} m apart there, more than its thickness of {thickness[worst]:.2g} m"
-            )
-        return float(coarseness[worst]) if worst >= 0 else 0.0
+        self._statistics.coarseness = position_coarseness(self.model, self.state, sizes.thickness)
 
     def _start_from_stage(self) -> None:
         """Start the induction from the moments of the stage, for example the result of an earlier run."""
@@ -368,29 +317,15 @@ class Simulation:
             for report in self._stepper.read_reports():
                 self._statistics.add_step(report)
         except SimulationError as error:
-            if not (cause := self._cause()):
+            if not (cause := failure_cause(self._magnetics, self._statistics, self._joint_gaps)):
                 raise
             raise SimulationError(f"{error}; {cause}") from None
 
-    def _cause(self) -> str:
-        """Return the probable cause of a state that is not finite; empty if unknown."""
-        if self._statistics.overlapping:
-            return "bodies overlapped at the start, and pushing them apart may make them spin ever faster"
-        if self._joint_gaps:
-            return f"the ends of the joint {next(iter(self._joint_gaps))} were apart at the start, and it pulls"
-        if self._statistics.capped:
-            return "bodies had been too fast for the shortest substep"
-        attributes = getattr(self.model, NAMESPACE)
-        strengths = {
-            "an applied field of {:.3g} A/m": self._magnetics.external_field.numpy(),
-            "a magnetization of {:.3g} A/m": attributes.magnetization.numpy(),
-            "a coil's current [A] or a field map's factor of {:.3g}": attributes.strength.numpy(),
-        }
-        for name, values in strengths.items():
-            strongest = float(np.abs(values).max(initial=0.0))
-            if strongest > _STRONGEST_FIELD:
-                return f"{name.format(strongest)} moves magnets too fast for the shortest substep"
-        return ""
+    def _follow(self, state: newton.State) -> None:
+        """Record the farthest distance of a magnet from the mean initial position."""
+        if len(self._moving):
+            distance = np.linalg.norm(self._positions(state) - self._center, axis=1).max()
+            self._statistics.farthest = max(self._statistics.farthest, float(distance))
 
     def _positions(self, state: newton.State) -> np.ndarray:
         return state.body_q.numpy()[self._moving, :3].astype(float)
@@ -444,7 +379,8 @@ class Simulation:
                 if resume:
                     resumed, complete = recorder.resume(frames, self._steps_at(frames), self.step_size)
                 if not complete:
-                    complete = self._run_frames(frames, recorder, on_frame, resumed)
+                    options = {"recorder": recorder, "on_frame": on_frame, "resumed": resumed}
+                    complete = run_frames(self, self._stepper, frames, self._steps_at, follow=self._follow, **options)
             finally:
                 if recorder:
                     recorder.close(complete)
@@ -454,33 +390,6 @@ class Simulation:
                 end.args = (", ".join(filter(None, (str(end), frames_so_far))),)
             raise
         return self.finish()
-
-    def _run_frames(self, frames: int, recorder, on_frame: Callable[[int], bool | None] | None, resumed: bool) -> bool:
-        """Simulate and record, without the first frame if ``resumed``; return True if all frames are done."""
-        statistics, before = self._statistics, self._statistics.wall_seconds
-        began = _running_time()
-        try:
-            for frame in range(frames + 1):
-                target = self._steps_at(frame)
-                if target <= self._stepper.steps and (frame or resumed):
-                    continue  # already recorded, or two frames of one long step would have the same time
-                ahead = min(self._stepper.steps + _AHEAD, target)
-                while self._stepper.steps < target:
-                    self.step()
-                    if recorder and self._stepper.steps == ahead:
-                        recorder.write()
-                state = self.state
-                if len(self._moving):
-                    distance = np.linalg.norm(self._positions(state) - self._center, axis=1).max()
-                    statistics.farthest = max(statistics.farthest, float(distance))
-                statistics.wall_seconds = before + _running_time() - began
-                if recorder:
-                    recorder.add_frame(self.time, state)
-                if on_frame and on_frame(frame) is False:
-                    return frame == frames
-            return True
-        finally:
-            statistics.wall_seconds = before + _running_time() - began
 
     def frames_of(self, frames: int | None) -> int:
         """Return the number of frames of a run, by default of the scene.
@@ -521,28 +430,11 @@ class Simulation:
         statistics.overlap = max(statistics.overlap, statistics.final_overlap)
         statistics.depth = max(statistics.depth, depth)
         speeds = np.linalg.norm(self.state.body_qd.numpy()[:, :3], axis=1)
-        held = np.intersect1d(np.flatnonzero(self._held_bodies()), self._moving)
+        held = np.flatnonzero(held_bodies(self.magnetics, self._solver, self._sizes))
+        held = np.intersect1d(held, self._moving)
         statistics.held = len(held)
         statistics.held_rms_speed, statistics.rms_speed = (
             float(np.sqrt(np.mean(speeds[bodies] ** 2))) if len(bodies) else 0.0 for bodies in (held, self._moving)
         )
         statistics.held_median_speed = float(np.median(speeds[held])) if len(held) else 0.0
         return statistics
-
-    def _held_bodies(self) -> np.ndarray:
-        """Return True for each body that a magnet holds, shape [body_count]."""
-        model, contacts = self.model, self._solver.contacts
-        shape_body = model.shape_body.numpy()
-        # each static shape counts as a body, numbered after the bodies of the model
-        node = np.where(shape_body >= 0, shape_body, model.body_count + np.arange(model.shape_count))
-        fixed = np.ones(model.body_count + model.shape_count, dtype=bool)
-        fixed[: model.body_count] = ~np.isfinite(self._sizes.thickness)
-        permanent = [magnet.magnet.kind == "permanent" for magnet in self.magnetics.magnets for _ in magnet.shapes]
-        holds = np.zeros_like(fixed)
-        holds[node[self.magnetics.shapes[fixed[node[self.magnetics.shapes]] | permanent]]] = True
-
-        count = int(contacts.rigid_contact_count.numpy()[0])
-        sides = [getattr(contacts, f"rigid_contact_shape{k}").numpy()[:count] for k in (0, 1)]
-        pairs = node[np.stack(sides, axis=1)]
-        touching = self._solver.overlaps.numpy()[:count] > -_TOUCHING
-        return find_held(pairs[touching], holds, fixed)[: model.body_count]

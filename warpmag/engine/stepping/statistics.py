@@ -37,7 +37,7 @@ class Statistics:
         depth: Deepest penetration [m].
         final_overlap: Deepest penetration at the end over the thickness of the thinner body.
         rms_speed: Root mean square speed of the magnets at the end [m/s].
-        held: Bodies held by a permanent or fixed magnet at the end, see :func:`find_held`.
+        held: Bodies held by a permanent or fixed magnet at the end, see ``held_bodies``.
         held_rms_speed: Root mean square speed of held bodies [m/s].
         held_median_speed: Median speed of held bodies [m/s]; below the RMS if single bodies slide without friction.
         farthest: Largest distance of a magnet from the mean initial position, in any frame [m].
@@ -168,27 +168,3 @@ class Statistics:
             f"field          {evaluations.mean():.1f} evaluations per step (median {np.median(evaluations):.0f}, "
             f"max {evaluations.max()}), magnetization error at most {self.error:.1e}{by_multipoles}",
         ]
-
-
-def find_held(pairs: np.ndarray, holders: np.ndarray, fixed: np.ndarray) -> np.ndarray:
-    """Return True for each body that a magnet holds, from the bodies that touch, shape [n, 2].
-
-    A held body touches a holder, a permanent or fixed magnet. Or it touches a held body and no ground. Ground is a
-    fixed body without magnets.
-    """
-
-    def neighbors(bodies: np.ndarray) -> np.ndarray:
-        """Return True for each body that touches one of ``bodies``."""
-        touched = np.zeros(len(fixed), dtype=bool)
-        for first, second in (pairs.T, pairs.T[::-1]):
-            touched[second[bodies[first]]] = True
-        return touched
-
-    grounded = neighbors(fixed & ~holders)
-    touching = neighbors(holders) & ~fixed & ~holders
-    held = touching
-    while True:
-        next_held = touching | (neighbors(held & ~grounded) & ~grounded & ~fixed & ~holders)
-        if (next_held == held).all():
-            return held
-        held = next_held
