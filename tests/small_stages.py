@@ -43,14 +43,14 @@ def ball(name, place, lines="", radius=R, magnet=True, body=True, kinematic=Fals
 """
 
 
-def joint(kind, one, other, place_of_one, place_of_other, lines="", name="Joint"):
+def joint(kind, body0, body1, place0, place1, lines="", name="Joint"):
     """A joint about the y axis between prims of the world, or None for the world itself."""
-    bodies = [f"rel physics:body{k} = </World/{prim}>" for k, prim in enumerate((one, other)) if prim]
+    bodies = [f"rel physics:body{k} = </World/{prim}>" for k, prim in enumerate((body0, body1)) if prim]
     axis = 'uniform token physics:axis = "Y"' if kind in ("Revolute", "Prismatic") else ""
     return f"""def Physics{kind}Joint "{name}" {{
     {chr(10).join([*bodies, axis])}
-    point3f physics:localPos0 = {place_of_one}
-    point3f physics:localPos1 = {place_of_other}
+    point3f physics:localPos0 = {place0}
+    point3f physics:localPos1 = {place1}
     quatf physics:localRot0 = (1, 0, 0, 0)
     quatf physics:localRot1 = (1, 0, 0, 0)
     {lines}
@@ -84,4 +84,4 @@ def told(path, folder, device, capsys, frames=2):
 
 A, B, C = (ball(name, (0.05 * k, 0.0, 1.0)) for k, name in enumerate("ABC"))
 RIGHT, LEFT = (0.025, 0.0, 0.0), (-0.025, 0.0, 0.0)
-CHAIN = [joint("Spherical", one, other, RIGHT, LEFT, name=one + other) for one, other in ("AB", "BC")]
+CHAIN = [joint("Spherical", *bodies, RIGHT, LEFT, name=bodies) for bodies in ("AB", "BC")]

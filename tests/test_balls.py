@@ -55,18 +55,18 @@ def _fields(thing) -> Iterator[tuple[str, Any]]:
             yield name, value
 
 
-def _same(found, wanted):
+def _same(computed, wanted):
     """Compare two models field by field; return how many there are."""
-    found, wanted = dict(_fields(found)), dict(_fields(wanted))
-    assert found.keys() == wanted.keys()
+    computed, wanted = dict(_fields(computed)), dict(_fields(wanted))
+    assert computed.keys() == wanted.keys()
     for name, value in wanted.items():
         if isinstance(value, np.ndarray) and value.dtype.kind == "f":
             # a quotient or a product in single precision, rounded in another order
-            np.testing.assert_allclose(found[name], value, rtol=3e-7, atol=0.0, err_msg=name)
+            np.testing.assert_allclose(computed[name], value, rtol=3e-7, atol=0.0, err_msg=name)
         elif isinstance(value, np.ndarray):
-            np.testing.assert_array_equal(found[name], value, err_msg=name)
+            np.testing.assert_array_equal(computed[name], value, err_msg=name)
         else:
-            assert repr(found[name]) == repr(value), name
+            assert repr(computed[name]) == repr(value), name
     return len(wanted)
 
 

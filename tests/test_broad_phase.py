@@ -150,7 +150,7 @@ def heap(device, *, free_box=False, static_cylinder=False):
     return builder.finalize(device=device)
 
 
-@pytest.mark.parametrize("others", [{}, {"free_box": True}, {"static_cylinder": True}], ids=lambda one: "".join(one))
+@pytest.mark.parametrize("others", [{}, {"free_box": True}, {"static_cylinder": True}], ids="".join)
 def test_newtons_narrow_phase_looks_where_something_is_left_to_it(others, device, monkeypatch):
     """And what moves by forces has all contacts that it has by comparing all pairs."""
     model = heap(device, **others)

@@ -79,14 +79,14 @@ def velocities(model, state, ends, gravity):
     return qd
 
 
-def surface_velocities(one, qd):
-    ends = zip(one.bodies, one.arms, strict=True)
+def surface_velocities(contact, qd):
+    ends = zip(contact.bodies, contact.arms, strict=True)
     return [qd[body, :3] + np.cross(qd[body, 3:], arm) if body >= 0 else np.zeros(3) for body, arm in ends]
 
 
-def opening_speed(one, v):
+def opening_speed(contact, v):
     """By which surfaces open faster than they have to; those that are moved do not close gaps."""
-    return (one.gives[1] * v[1] - one.gives[0] * v[0]) @ one.normal + max(one.gap / DT, -RECOVERY_SPEED)
+    return (contact.gives[1] * v[1] - contact.gives[0] * v[0]) @ contact.normal + max(contact.gap / DT, -RECOVERY_SPEED)
 
 
 def solve(solver, model, state, contacts):

@@ -122,11 +122,11 @@ def solve(case, dtype, device, **arguments):
     return result, force, torque, [str(entry.message) for entry in caught]
 
 
-def true_residual(case, found):
+def true_residual(case, solution):
     """The residual in float64, of the magnetizations as found."""
     n = len(case.positions)
     radii = np.broadcast_to(np.asarray(case.radii, float), n)
-    m = np.asarray(found.magnetizations, float)
+    m = np.asarray(solution.magnetizations, float)
     h = np.broadcast_to(np.asarray(case.applied, float), (n, 3)).copy()
     h += oracle.h_field(case.positions, m * (4.0 / 3.0 * np.pi * radii**3)[:, None], radii=radii)
     if "permanent" in case.arguments:

@@ -69,7 +69,10 @@ def test_balls_in_one_another(arrange, ratio, dtype, scale, device):
 
 @pytest.mark.parametrize(
     "arrange, ratio, depth",
-    [*((in_one_another, *one) for one in ((1.3, 0.05), (3.0, 0.2), (8.0, 0.85), (20.0, 0.5))), (two_in_one, 5.0, 0.3)],
+    [
+        *((in_one_another, *sizes) for sizes in ((1.3, 0.05), (3.0, 0.2), (8.0, 0.85), (20.0, 0.5))),
+        (two_in_one, 5.0, 0.3),
+    ],
 )
 def test_reference_forces_are_the_gradient_of_its_energy(arrange, ratio, depth):
     """A ball in or through another, beside a contact: U of balls in one another goes with the field that it makes."""

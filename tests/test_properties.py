@@ -17,9 +17,9 @@ ANY = settings(max_examples=25, deadline=None, suppress_health_check=[HealthChec
 DOUBLE = {"dtype": "float64"}
 
 
-def close(found, expected, rtol=2e-13):
-    found, expected = np.asarray(found), np.asarray(expected)
-    return np.abs(found - expected).max(initial=0.0) <= rtol * np.abs(expected).max(initial=0.0)
+def close(computed, expected, rtol=2e-13):
+    computed, expected = np.asarray(computed), np.asarray(expected)
+    return np.abs(computed - expected).max(initial=0.0) <= rtol * np.abs(expected).max(initial=0.0)
 
 
 def draw(seed, count):

@@ -69,13 +69,13 @@ def rub(layer, friction):
             UsdPhysics.MaterialAPI(prim).GetDynamicFrictionAttr().Set(friction)
 
 
-def first_difference(found, expected):
+def first_difference(run, expected):
     """Where two runs, evaluations, substeps and samples, differ first: a step or the samples of the earliest time."""
-    steps = [step for step, pair in enumerate(zip(found[0], expected[0], strict=False)) if pair[0] != pair[1]]
-    lines = [f"step {step}: {found[0][step]} evaluations, not {expected[0][step]}" for step in steps[:1]]
-    (of_found, of_expected), missing = (found[2], expected[2]), (None, {})
-    paths = sorted(of_found.keys() | of_expected.keys())
-    both = [(path, of_found.get(path, missing), of_expected.get(path, missing)) for path in paths]
+    steps = [step for step, pair in enumerate(zip(run[0], expected[0], strict=False)) if pair[0] != pair[1]]
+    lines = [f"step {step}: {run[0][step]} evaluations, not {expected[0][step]}" for step in steps[:1]]
+    (of_run, of_expected), missing = (run[2], expected[2]), (None, {})
+    paths = sorted(of_run.keys() | of_expected.keys())
+    both = [(path, of_run.get(path, missing), of_expected.get(path, missing)) for path in paths]
     lines += [f"{path}: {mine[0]}, not {its[0]}" for path, mine, its in both if mine[0] != its[0]][:1]
     apart = [
         (time, path, mine[1].get(time), its[1].get(time))
@@ -83,8 +83,8 @@ def first_difference(found, expected):
         for time in mine[1].keys() | its[1].keys()
         if mine[1].get(time) != its[1].get(time)
     ]
-    lines += [f"{path} at {time}: {a}, not {b}" for time, path, a, b in sorted(apart, key=lambda one: one[:2])[:1]]
-    return "; ".join([*lines, f"{found[1]} substeps and {expected[1]}"])
+    lines += [f"{path} at {time}: {a}, not {b}" for time, path, a, b in sorted(apart, key=lambda row: row[:2])[:1]]
+    return "; ".join([*lines, f"{run[1]} substeps and {expected[1]}"])
 
 
 def assert_begins_like(output, reference):
@@ -277,8 +277,8 @@ def test_what_is_written_of_a_scene_edited_in_memory_has_the_edits(kind, scene, 
     simulation.run(1, output=output)
     program = (
         f"from pxr import Usd, UsdPhysics\nstage = Usd.Stage.Open({str(output)!r})\n"
-        "found = [UsdPhysics.MaterialAPI(one).GetDynamicFrictionAttr().Get() for one in stage.Traverse()]\n"
-        "print({one for one in found if one is not None})"
+        "frictions = [UsdPhysics.MaterialAPI(prim).GetDynamicFrictionAttr().Get() for prim in stage.Traverse()]\n"
+        "print({friction for friction in frictions if friction is not None})"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "{0.25}\n"

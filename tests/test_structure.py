@@ -80,6 +80,10 @@ OUTSIDE_TREES = {
     for path in sorted((ROOT / folder).rglob("*.py"))
 }
 """Benchmarks, and what authors the bundled scenes."""
+TEST_TREES = {
+    path.relative_to(ROOT): ast.parse(path.read_text(encoding="utf-8"))
+    for path in sorted((ROOT / "tests").rglob("*.py"))
+}
 MODULES = {".".join(("warpmag.kernels", *path.with_suffix("").parts)): path for path in SOURCES}
 
 
@@ -325,7 +329,7 @@ def test_docstrings_open_with_their_subject():
 
 def test_variables_are_named_after_what_they_hold():
     wrong = []
-    for path, tree in ALL_TREES.items():
+    for path, tree in (ALL_TREES | TEST_TREES).items():
         for node in ast.walk(tree):
             name = node.id if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) else ""
             name = node.arg if isinstance(node, ast.arg) else name

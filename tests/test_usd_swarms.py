@@ -60,10 +60,10 @@ def arrays(recording):
     return rows, moments, dict(zip(recording.magnets, recording.permanent.tolist(), strict=True))
 
 
-def same(found, wanted, atol):
-    assert found.keys() == wanted.keys()
+def same(computed, wanted, atol):
+    assert computed.keys() == wanted.keys()
     for name, values in wanted.items():
-        np.testing.assert_allclose(found[name], values, rtol=1e-6, atol=atol, err_msg=name)
+        np.testing.assert_allclose(computed[name], values, rtol=1e-6, atol=atol, err_msg=name)
 
 
 def test_an_instancer_says_what_prims_say(runs, whole):

@@ -34,7 +34,7 @@ FALLING = {
     "a chain": [physics(), A, B, C, *CHAIN],
     "a chain named from its end": [
         *(physics(), A, B, C),
-        *(joint("Revolute", one, other, LEFT, RIGHT, name=one + other) for one, other in ("CB", "BA")),
+        *(joint("Revolute", *bodies, LEFT, RIGHT, name=bodies) for bodies in ("CB", "BA")),
     ],
     "two joints into one body": [
         *(physics(), A, B, C, CHAIN[0]),
@@ -112,12 +112,12 @@ def test_a_distance_joint_is_a_rope(device, tmp_path):
     assert np.linalg.norm(speeds[0, :3]) == pytest.approx(math.sqrt(2.0 * G * LENGTH), rel=0.015)
 
 
-@pytest.mark.parametrize(("one", "other", "fallen"), [(None, "Bob", 20.0), ("Bob", None, 10.0)])
-def test_limits_count_from_body0_to_body1(one, other, fallen, device, tmp_path):
-    ends = [(0, 0, 1), SECOND] if one is None else [SECOND, (0, 0, 1)]
+@pytest.mark.parametrize(("body0", "body1", "fallen"), [(None, "Bob", 20.0), ("Bob", None, 10.0)])
+def test_limits_count_from_body0_to_body1(body0, body1, fallen, device, tmp_path):
+    ends = [(0, 0, 1), SECOND] if body0 is None else [SECOND, (0, 0, 1)]
     limits = "float physics:lowerLimit = -10\n float physics:upperLimit = 20"
     simulation = Simulation(
-        write(tmp_path, physics(), SWUNG, joint("Revolute", one, other, *ends, limits)), device=device
+        write(tmp_path, physics(), SWUNG, joint("Revolute", body0, body1, *ends, limits)), device=device
     )
     [pose], _ = advance(simulation, 0.4)
     assert math.degrees(math.atan2(1.0 - pose[2], pose[0])) == pytest.approx(fallen, abs=0.1)

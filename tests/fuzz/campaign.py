@@ -251,7 +251,7 @@ def in_fresh_process(*arguments: str) -> tuple[int, list[str], list[str]]:
     done = subprocess.run(
         [sys.executable, "-m", "warpmag.cli", *arguments], capture_output=True, check=False, env=_FRESH, cwd=_ROOT
     )
-    out, err = (one.decode(errors="replace").splitlines() for one in (done.stdout, done.stderr))
+    out, err = (stream.decode(errors="replace").splitlines() for stream in (done.stdout, done.stderr))
     return done.returncode, out, err if done.returncode >= 0 else [*err, f"died of signal {-done.returncode}"]
 
 
@@ -292,10 +292,10 @@ def talk(command: str, lines: list[str]) -> list[str]:
         return [f"{command}: traceback: {lines[-1][:200]}"]
     # a warning erases the bar above it with blanks
     strange = [line for line in lines if line.strip() and not _EXPECTED.search(line)]
-    found = [f"{command}: said {strange[0][:200]!r} and {len(strange) - 1} lines more"] if strange else []
+    problems = [f"{command}: said {strange[0][:200]!r} and {len(strange) - 1} lines more"] if strange else []
     if len(messages(lines)) > 1:
-        found.append(f"{command}: {len(messages(lines))} lines of errors")
-    return found + [f"{command}: a line of {len(line)}" for line in lines if len(line) > _LONGEST_LINE]
+        problems.append(f"{command}: {len(messages(lines))} lines of errors")
+    return problems + [f"{command}: a line of {len(line)}" for line in lines if len(line) > _LONGEST_LINE]
 
 
 def _disagreements(check: int, errors: list[str], run: int, refusals: list[str]) -> list[str]:

@@ -86,11 +86,11 @@ def lengthen(data, chance):
 
 def renumber(data, chance):
     """Put another number in the place of one."""
-    found = list(re.finditer(rb"(?<![\w.])-?\d[\d.e+-]*", data))
-    if not found:
+    numbers = list(re.finditer(rb"(?<![\w.])-?\d[\d.e+-]*", data))
+    if not numbers:
         return data
-    one = chance.choice(found)
-    return data[: one.start()] + chance.choice(NUMBERS) + data[one.end() :]
+    number = chance.choice(numbers)
+    return data[: number.start()] + chance.choice(NUMBERS) + data[number.end() :]
 
 
 def drop(data, chance):
@@ -110,11 +110,11 @@ def repeat(data, chance):
 
 def retype(data, chance):
     """Put another word in the place of one."""
-    found = list(re.finditer(rb"\b[A-Za-z_:]{3,}\b", data))
-    if not found:
+    words = list(re.finditer(rb"\b[A-Za-z_:]{3,}\b", data))
+    if not words:
         return data
-    one, other = chance.choice(found), chance.choice(found)
-    return data[: one.start()] + other.group() + data[one.end() :]
+    word, other = chance.choice(words), chance.choice(words)
+    return data[: word.start()] + other.group() + data[word.end() :]
 
 
 _TEXT = (cut, garble, garble, insert, insert, lengthen, renumber, renumber, renumber, drop, repeat, retype, retype)

@@ -233,7 +233,7 @@ def mesh(layer, prims, chance) -> str:
         points, faces, counts = points[:2], faces[:6], counts[:2]
     elif fault == 6:
         faces, counts = faces[:9], counts[:3]
-    _set(_attribute(prim, "points", "point3f[]"), Vt.Vec3fArray([Gf.Vec3f(*_single(one)) for one in points]))
+    _set(_attribute(prim, "points", "point3f[]"), Vt.Vec3fArray([Gf.Vec3f(*_single(point)) for point in points]))
     _set(_attribute(prim, "faceVertexIndices", "int[]"), Vt.IntArray(faces))
     _set(_attribute(prim, "faceVertexCounts", "int[]"), Vt.IntArray(counts))
     return f"{prim.path} a mesh, fault {fault}"
@@ -244,7 +244,7 @@ def schema(layer, prims, chance) -> str:
     prim = layer.GetPrimAtPath(chance.choice(prims))
     name = chance.choice(SCHEMAS)
     before = prim.GetInfo("apiSchemas") if prim.HasInfo("apiSchemas") else Sdf.TokenListOp()
-    kept = [one for one in before.GetAppliedItems() if chance.random() < 0.9]
+    kept = [item for item in before.GetAppliedItems() if chance.random() < 0.9]
     prim.SetInfo("apiSchemas", Sdf.TokenListOp.CreateExplicit([*dict.fromkeys((*kept, name))]))
     return f"{name} on {prim.path}"
 
@@ -289,13 +289,13 @@ FAULTS: tuple[Callable, ...] = (
 
 def _prims(layer) -> list[Sdf.Path]:
     """Return some hundred prims, the first ones where there are more; those with schemas several times."""
-    found, left = [], list(layer.rootPrims)
-    while left and len(found) < _MANY:
+    paths, left = [], list(layer.rootPrims)
+    while left and len(paths) < _MANY:
         prim = left.pop(0)
         physical = prim.HasInfo("apiSchemas") or prim.typeName.startswith("Physics")
-        found += [prim.path] * (6 if physical else 1)
+        paths += [prim.path] * (6 if physical else 1)
         left[:0] = list(prim.nameChildren)[:_MANY]
-    return sorted(found) or [Sdf.CreatePrimInLayer(layer, "/Empty").path]
+    return sorted(paths) or [Sdf.CreatePrimInLayer(layer, "/Empty").path]
 
 
 def _some_attribute(layer, prims, chance):

@@ -17,8 +17,8 @@ TIMES = (-1e300, -5.0, 0.0, 0.5, 1.0, 1e9, 1e300)
 
 def units(layer, prims, chance) -> str:
     """Other units, another axis up, another default prim."""
-    choices = [("metersPerUnit", one) for one in (0.01, 0.001, 0.0254)]
-    choices += [("upAxis", one) for one in ("Y", "Y", "X", "z", "")]
+    choices = [("metersPerUnit", unit) for unit in (0.01, 0.001, 0.0254)]
+    choices += [("upAxis", axis) for axis in ("Y", "Y", "X", "z", "")]
     choices += [("kilogramsPerUnit", 0.001), ("defaultPrim", chance.choice(("Nowhere", "", "World/A")))]
     key, value = chance.choice(choices)
     layer.pseudoRoot.SetInfo(key, value)
@@ -119,8 +119,8 @@ def crowd(layer, prims, chance) -> str:
     if kind == 0:
         with Sdf.ChangeBlock():
             for number in range(count):
-                one = Sdf.CreatePrimInLayer(layer, f"/Crowd/x{number}")
-                one.specifier, one.typeName = Sdf.SpecifierDef, chance.choice(("Xform", "Sphere", "Scope"))
+                prim = Sdf.CreatePrimInLayer(layer, f"/Crowd/x{number}")
+                prim.specifier, prim.typeName = Sdf.SpecifierDef, chance.choice(("Xform", "Sphere", "Scope"))
         return f"{count} prims more"
     if kind == 1:
         for number in range(chance.choice((10, 30))):  # a hundred bodies of 250 moments take minutes, and rightly
@@ -228,17 +228,17 @@ def empty(layer, prims, chance) -> str:
     """Take away what a stage is about: all prims, the scene, the units, the times."""
     kind = chance.randrange(3)
     if kind == 0:
-        for one in list(layer.rootPrims):
-            del layer.rootPrims[one.name]
+        for prim in list(layer.rootPrims):
+            del layer.rootPrims[prim.name]
     elif kind == 1:
         for key in layer.pseudoRoot.ListInfoKeys():
             if key not in ("primChildren", "subLayers", "subLayerOffsets"):
                 layer.pseudoRoot.ClearInfo(key)
     else:
         scenes = {path for path in prims if layer.GetPrimAtPath(path).typeName == "PhysicsScene"}
-        for one in sorted(scenes, reverse=True):  # what is below others first
-            place = layer.GetPrimAtPath(one)
-            del (place.nameParent or layer.pseudoRoot).nameChildren[one.name]
+        for path in sorted(scenes, reverse=True):  # what is below others first
+            place = layer.GetPrimAtPath(path)
+            del (place.nameParent or layer.pseudoRoot).nameChildren[path.name]
     return ("no prims", "no metadata", "no scene")[kind]
 
 

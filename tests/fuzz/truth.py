@@ -23,22 +23,22 @@ def differences(path: Path, output: Path, simulation) -> list[str]:
     """Return where a run says other things than its stage; without the simulation, where its cache does."""
     stage, result = Usd.Stage.Open(str(path)), Usd.Stage.Open(str(output))
     reading = Reading(stage)
-    found = [*not_finite(result), *_poses(reading, result), *_instances(reading, result), *_moments(reading, result)]
+    problems = [*not_finite(result), *_poses(reading, result), *_instances(reading, result), *_moments(reading, result)]
     if simulation is not None:
-        found += [*_masses(reading, simulation), *_shapes(reading, simulation), *_gravity(reading, simulation)]
-        found += _sources(reading, simulation)
-    return found
+        problems += [*_masses(reading, simulation), *_shapes(reading, simulation), *_gravity(reading, simulation)]
+        problems += _sources(reading, simulation)
+    return problems
 
 
 def _prims_of(stage) -> tuple[list, list]:
     """Prims that are no prototypes of instancers, and the instancers."""
     prims, instancers = [], []
-    found = iter(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
-    for prim in found:
+    traversal = iter(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
+    for prim in traversal:
         prims.append(prim)
         if prim.IsA(UsdGeom.PointInstancer):
             instancers.append(UsdGeom.PointInstancer(prim))
-            found.PruneChildren()
+            traversal.PruneChildren()
     return prims, instancers
 
 
@@ -62,7 +62,7 @@ class Reading:
         return default if value is None else value
 
     def enabled(self, switch, api) -> list:
-        return [one for one in self.prims if api in one.GetAppliedSchemas() and self.get(one, switch, True)]
+        return [prim for prim in self.prims if api in prim.GetAppliedSchemas() and self.get(prim, switch, True)]
 
     def world(self, prim) -> np.ndarray:
         return np.array(self.transforms.GetLocalToWorldTransform(prim))
@@ -75,17 +75,17 @@ class Reading:
 
     def driven(self) -> list:
         """Colliders of no body that time samples move, and that are in none of them: they become kinematic bodies."""
-        found = []
+        moving = []
         for prim in self.colliders:
-            lineage = [prim, *(one for one in self.prims if prim.GetPath().HasPrefix(one.GetPath()))]
-            if self.above(prim) or not set(lineage).isdisjoint(found):
+            lineage = [prim, *(ancestor for ancestor in self.prims if prim.GetPath().HasPrefix(ancestor.GetPath()))]
+            if self.above(prim) or not set(lineage).isdisjoint(moving):
                 continue
-            placed = [UsdGeom.Xformable(one) for one in lineage if one.IsA(UsdGeom.Xformable)]
-            times = {time for one in placed for time in one.GetTimeSamples()}
+            placed = [UsdGeom.Xformable(ancestor) for ancestor in lineage if ancestor.IsA(UsdGeom.Xformable)]
+            times = {time for xformable in placed for time in xformable.GetTimeSamples()}
             poses = [np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(prim)) for time in times]
             if any((pose != poses[0]).any() for pose in poses):
-                found.append(prim)
-        return found
+                moving.append(prim)
+        return moving
 
     def volume(self, prim) -> float | None:
         """Volume of a collider, None where its approximation decides."""
@@ -145,13 +145,16 @@ class Reading:
 
     def density(self, prim) -> float:
         """Density of a collider: its own, that of what it is part of, its material's, water's."""
-        one = prim
-        while one and not one.IsPseudoRoot():
-            if "PhysicsMassAPI" in one.GetAppliedSchemas() and (own := self.get(one, "physics:density", 0.0)) > 0.0:
+        holder = prim
+        while holder and not holder.IsPseudoRoot():
+            if (
+                "PhysicsMassAPI" in holder.GetAppliedSchemas()
+                and (own := self.get(holder, "physics:density", 0.0)) > 0.0
+            ):
                 return own
-            if one in self.bodies:
+            if holder in self.bodies:
                 break
-            one = one.GetParent()
+            holder = holder.GetParent()
         material = self.material(prim)
         given = material and "PhysicsMaterialAPI" in material.GetAppliedSchemas()
         own = given and self.get(material, "physics:density", 0.0)
@@ -159,8 +162,10 @@ class Reading:
 
     def usual_density(self, prim) -> float:
         """Density of a collider of which nobody says anything [kg/m³]: that of the magnet's material, or water's."""
-        magnets = [one for one in (prim, self.above(prim)) if one and "WarpmagMagnetAPI" in one.GetAppliedSchemas()]
-        named = [name for one in magnets if (name := self.get(one, "warpmag:material"))]
+        magnets = [
+            magnet for magnet in (prim, self.above(prim)) if magnet and "WarpmagMagnetAPI" in magnet.GetAppliedSchemas()
+        ]
+        named = [name for magnet in magnets if (name := self.get(magnet, "warpmag:material"))]
         return DENSITIES[named[0]] if named else DENSITY
 
     def own_mass(self, prim) -> float:
@@ -172,13 +177,13 @@ class Reading:
         if own := self.own_mass(body):
             return own
         total = 0.0
-        for one in self.colliders:
-            if self.above(one) == body:
-                own = self.own_mass(one)
-                volume = self.volume(one)
-                if (volume is None or self.is_ambiguous(one)) and not own:
+        for collider in self.colliders:
+            if self.above(collider) == body:
+                own = self.own_mass(collider)
+                volume = self.volume(collider)
+                if (volume is None or self.is_ambiguous(collider)) and not own:
                     return None
-                total += own or volume * self.density(one)
+                total += own or volume * self.density(collider)
         masses = list(self.instanced_masses(body))
         return None if None in masses else total + sum(masses)
 
@@ -225,7 +230,7 @@ class Reading:
 
 def not_finite(stage) -> list[str]:
     """Return the attributes written by a run that hold numbers that are none."""
-    found = []
+    problems = []
     for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
         names = [name for name in prim.GetAuthoredPropertyNames() if name.endswith(":warpmag")]
         for name in (*names, *(WRITTEN if names or prim.HasAttribute("warpmag:moment") else ())):
@@ -234,9 +239,9 @@ def not_finite(stage) -> list[str]:
                 value = attribute.Get(time)
                 numbers = (value.GetReal(), *value.GetImaginary()) if hasattr(value, "GetReal") else value
                 if not np.isfinite(np.array(numbers, dtype=float)).all():
-                    found.append(f"not finite: {attribute.GetPath()} at {time}")
+                    problems.append(f"not finite: {attribute.GetPath()} at {time}")
                     break
-    return found[:3]
+    return problems[:3]
 
 
 def _poses(reading, result):
@@ -251,9 +256,9 @@ def _poses(reading, result):
             yield f"pose of {prim.GetPath()}: {np.abs(given - written).max():g} off"
         for name in ("physics:velocity", "physics:angularVelocity"):
             wanted = np.array(reading.get(prim, name, (0.0, 0.0, 0.0)), dtype=float)
-            found = np.array(result.GetPrimAtPath(prim.GetPath()).GetAttribute(name).Get(start), dtype=float)
-            if not np.allclose(wanted, found, rtol=1e-4, atol=1e-5 * np.abs(wanted).max() + 1e-12):
-                yield f"{name} of {prim.GetPath()}: {found} for {wanted}"
+            value = np.array(result.GetPrimAtPath(prim.GetPath()).GetAttribute(name).Get(start), dtype=float)
+            if not np.allclose(wanted, value, rtol=1e-4, atol=1e-5 * np.abs(wanted).max() + 1e-12):
+                yield f"{name} of {prim.GetPath()}: {value} for {wanted}"
 
 
 def _instances(reading, result):
@@ -272,10 +277,10 @@ def _instances(reading, result):
             prim = result.GetPrimAtPath(f"{instancer.GetPath()}/instance{row}/{root.GetName()}")
             if not prim or root.IsA(UsdGeom.PointInstancer):  # inactive
                 continue
-            given, found = np.array(matrix * above), np.array(cache.GetLocalToWorldTransform(prim))
+            given, pose = np.array(matrix * above), np.array(cache.GetLocalToWorldTransform(prim))
             size = np.abs(given[3, :3]).max() + np.linalg.norm(given[:3, :3], axis=1).max()
-            if not np.abs(given - found).max() <= 2e-3 * size:  # half-precision quaternions
-                yield f"pose of {prim.GetPath()}: {np.abs(given - found).max():g} off"
+            if not np.abs(given - pose).max() <= 2e-3 * size:  # half-precision quaternions
+                yield f"pose of {prim.GetPath()}: {np.abs(given - pose).max():g} off"
 
 
 def _masses(reading, simulation):
@@ -286,14 +291,14 @@ def _masses(reading, simulation):
         yield f"bodies: {len(numbers)} in the model, {len(bodies)} on the stage"
         return
     for prim in reading.bodies:
-        wanted, found = reading.mass(prim), masses[numbers[str(prim.GetPath())]]
+        wanted, mass = reading.mass(prim), masses[numbers[str(prim.GetPath())]]
         wanted = None if wanted is None else reading.kilograms * wanted
         # Newton may find none for the hull of an open mesh, which counts for nothing where it is kinematic
-        counts = found != 0.0 or not reading.get(prim, "physics:kinematicEnabled", False)
-        if counts and wanted is not None and not math.isclose(wanted, found, rel_tol=1e-3):
-            yield f"mass of {prim.GetPath()}: {found:g} for {wanted:g}"
-        if not (math.isfinite(found) and np.isfinite(inverses).all()):
-            yield f"mass of {prim.GetPath()} is {found}"
+        counts = mass != 0.0 or not reading.get(prim, "physics:kinematicEnabled", False)
+        if counts and wanted is not None and not math.isclose(wanted, mass, rel_tol=1e-3):
+            yield f"mass of {prim.GetPath()}: {mass:g} for {wanted:g}"
+        if not (math.isfinite(mass) and np.isfinite(inverses).all()):
+            yield f"mass of {prim.GetPath()} is {mass}"
 
 
 def _shapes(reading, simulation):
@@ -331,9 +336,9 @@ def _gravity(reading, simulation):
     direction = np.array(reading.get(scenes[0], "physics:gravityDirection", (0.0, 0.0, 0.0)), dtype=float)
     direction = direction / np.linalg.norm(direction) if direction.any() else -np.array(up)
     wanted = direction * (9.81 if strength < 0.0 else reading.metres * strength)
-    found = simulation.model.gravity.numpy()[0]
-    if not np.allclose(wanted, found, rtol=1e-3, atol=1e-6):
-        yield f"gravity {found} for {wanted}"
+    gravity = simulation.model.gravity.numpy()[0]
+    if not np.allclose(wanted, gravity, rtol=1e-3, atol=1e-6):
+        yield f"gravity {gravity} for {wanted}"
 
 
 def _sources(reading, simulation):
@@ -352,12 +357,12 @@ def _sources(reading, simulation):
         if index is None:
             yield f"source {prim.GetPath()} is not in the model"
             continue
-        wanted, found = (
+        wanted, center = (
             reading.metres * reading.world(prim)[3, :3],
             (_matrix(frames[index]) @ poses[bodies[index] + 1])[3, :3],
         )
-        if not np.allclose(wanted, found, rtol=1e-4, atol=1e-4 * np.abs(wanted).max() + 1e-9):
-            yield f"place of {prim.GetPath()}: {found} for {wanted}"
+        if not np.allclose(wanted, center, rtol=1e-4, atol=1e-4 * np.abs(wanted).max() + 1e-9):
+            yield f"place of {prim.GetPath()}: {center} for {wanted}"
         name, usual = {
             "WarpmagCoilAPI": ("warpmag:coil:ampereTurns", 0.0),
             "WarpmagFieldMapAPI": ("warpmag:fieldMap:factor", 1.0),
@@ -431,9 +436,9 @@ def _shares(reading, prim) -> bool:
     """Whether another collider of the same body may have some of the volume of a collider that is a magnet."""
     box = UsdGeom.BBoxCache(reading.time, [UsdGeom.Tokens.default_, UsdGeom.Tokens.render, UsdGeom.Tokens.proxy])
     own, body = box.ComputeWorldBound(prim).ComputeAlignedRange(), reading.above(prim)
-    others = [one for one in reading.colliders if body and one != prim and reading.above(one) == body]
-    ranges = [box.ComputeWorldBound(one).ComputeAlignedRange() for one in others]
-    return any(not Gf.Range3d.GetIntersection(own, one).IsEmpty() for one in ranges)
+    others = [other for other in reading.colliders if body and other != prim and reading.above(other) == body]
+    ranges = [box.ComputeWorldBound(other).ComputeAlignedRange() for other in others]
+    return any(not Gf.Range3d.GetIntersection(own, span).IsEmpty() for span in ranges)
 
 
 def _turn(cache, prim) -> np.ndarray:
