@@ -1,6 +1,5 @@
 """Magnetic forces on the bodies of a Newton model."""
 
-from dataclasses import replace
 from typing import Any
 
 import newton
@@ -19,8 +18,10 @@ from warpmag.engine.magnets.caller_values import device_vectors, world_indices
 from warpmag.engine.magnets.distant_magnets import DistantMagnets, distant_bodies
 from warpmag.engine.magnets.eddy import gather_velocities, set_conductivities
 from warpmag.engine.magnets.equal_worlds import equal_worlds
-from warpmag.engine.magnets.grouping import BodyMagnet, find_magnets
+from warpmag.engine.magnets.grouping import find_magnets
 from warpmag.engine.magnets.imported_field import imported_field
+from warpmag.engine.magnets.kept_solution import KeptSolution
+from warpmag.engine.magnets.material_changes import change_materials
 from warpmag.engine.magnets.model_values import ModelValues, magnetic_arrays
 from warpmag.engine.magnets.placed_moments import PlacedMoments
 from warpmag.engine.magnets.pose_gradients import ForceGradients
@@ -39,8 +40,6 @@ from warpmag.moments.arrays import (
     Numbers,
     host_array,
     largest_coordinate,
-    restore_snapshot,
-    take_snapshot,
 )
 from warpmag.moments.probe import FieldProbe
 from warpmag.moments.ranks import current_ranks
@@ -350,21 +349,8 @@ class Magnetics:
         check_whole("flags", flags)
         if not int(flags) & int(newton.ModelFlags.SHAPE_PROPERTIES):
             return
-        changed = self._values.changed_materials()
-        for placed in (self._placed, *(self._distant.levels if self._distant is not None else ())):
-            moment_shapes = placed.table.shape.numpy()
-            affected = np.isin(moment_shapes, changed) & ~placed.table.permanent.numpy()
-            affected[placed.recoiling.numpy()] = False
-            moments = np.flatnonzero(affected)
-            placed.system.set_material(moments, *self._values.material(moment_shapes[moments]))
-        self.magnets = [self._with_material(magnet) for magnet in self.magnets]
-        self._values.accept_changes()
-
-    def _with_material(self, body_magnet: BodyMagnet) -> BodyMagnet:
-        """Return the magnet with the present material of its first shape."""
-        (saturation,), (susceptibility,) = self._values.material(list(body_magnet.shapes[:1]))
-        magnet = replace(body_magnet.magnet, saturation=float(saturation), susceptibility=float(susceptibility))
-        return replace(body_magnet, magnet=magnet)
+        levels = () if self._distant is None else self._distant.levels
+        self.magnets = change_materials(self._values, (self._placed, *levels), self.magnets)
 
     def persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays that the next step depends on, by name: values set by the user and the last solution."""
@@ -479,11 +465,11 @@ class Magnetics:
             InputError: A point is not finite or too far away (see ``warpmag.moments.arrays``), or its world holds no
                 magnets.
         """
-        largest = max(float(magnet.lattice.radii.max()) for magnet in self.magnets)
-        context = CallContext(self.system.device, self.system.dtype, warp_out=False)
-        points = context.vectors("points", points, farthest=largest_coordinate(self.system.dtype, largest))
+        system = self.system
+        context = CallContext(system.device, system.dtype, warp_out=False)
+        points = context.vectors("points", points, farthest=largest_coordinate(system.dtype, system.largest_radius))
         indices = world_indices(worlds, self._worlds, len(points))
-        probe = FieldProbe(self.system, len(points), worlds=indices, gradients=gradients)
+        probe = FieldProbe(system, len(points), worlds=indices, gradients=gradients)
         wp.copy(probe.points, points)
         return probe
 
@@ -576,26 +562,19 @@ class Magnetics:
             Total moment of each magnetic shape [A·m²], world frame, shape [n, 3].
         """
         self._check_state(state, "body_q")
-        systems, induced, persistent = self._systems, self._induced, self._solutions()
-        fields = [array for system in systems for array in system.field_arrays()]
-        saved, saved_fields = take_snapshot(persistent), [wp.clone(array) for array in fields]
-
-        def restore():
-            restore_snapshot(persistent, saved)
-            for array, values in zip(fields, saved_fields, strict=True):
-                wp.copy(array, values)
-
+        fields = [array for system in self._systems for array in system.field_arrays()]
+        kept, induced = KeptSolution(self._solutions(), fields), self._induced
         try:
             self.induce(state)
             self.check_model()
             self._warn_unconverged()
             return self.sum_moments().numpy().copy()
         finally:
-            restore()
+            kept.restore()
             self._induced = induced
             if induced:
                 (self._distant or self.system).evaluate_again()
-                restore()
+                kept.restore()
 
     def start_from(self, magnetizations: dict[int, np.ndarray]) -> None:
         """Set the magnetizations that the next induction starts from.
