@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import warpmag
-from warpmag.engine.magnets import grouping, sampling
+from warpmag.engine.magnets import grouping, magnet_system, sampling
 from warpmag.errors import InputError
-from warpmag.shapes import shape_cache
+from warpmag.shapes import polyhedra, shape_cache
 from warpmag.shapes.shape_cache import ShapeCache
 
 
@@ -104,3 +104,21 @@ def test_a_second_model_reads_its_shapes(tmp_path, monkeypatch):
         np.testing.assert_array_equal(computed.positions, read.positions)
         np.testing.assert_array_equal(computed.coupling.tensor, read.coupling.tensor)
         assert computed is not read
+
+
+def test_a_second_model_reads_the_table_of_a_cylinder_over_iron(tmp_path, monkeypatch):
+    monkeypatch.setattr(magnet_system, "shape_cache", lambda: ShapeCache(tmp_path))
+    builder = newton.ModelBuilder()
+    warpmag.register_custom_attributes(builder)
+    plate, disc = builder.add_body(), builder.add_body()
+    builder.add_shape_box(plate, hx=0.01, hy=0.01, hz=0.002)
+    warpmag.add_inducible(builder, body=plate, moment_spacing=0.004)
+    builder.add_shape_cylinder(disc, radius=0.0049, half_height=0.0021)
+    warpmag.add_permanent(builder, body=disc, magnetization=(0.0, 0.0, 1e6))
+    model, tables = builder.finalize(device="cpu"), []
+    for _ in range(2):
+        system = warpmag.Magnetics(model).system
+        tables.append(system.source_interaction.arrays.cells.cylinders.numpy())
+        monkeypatch.setattr(polyhedra, "potential_table", None)
+    np.testing.assert_array_equal(*tables)
+    assert len(list(tmp_path.iterdir())) == 1 and len(tables[0]) > 1000

@@ -162,7 +162,10 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solids, so
     arrays.grid, arrays.rotation = put(repeat_rows(grids, copies), dtype), rotations
     arrays.point = put(unit_points().ravel(), dtype)
     arrays.response = put(np.concatenate([body.response.ravel() for body in shapes]), dtype)
-    potentials = [solid.shape.potential_table() for solid in of_each_shape(solids).values()]
+    potentials = [
+        solid.shape.potential_table() if solid.potential is None else solid.potential
+        for solid in of_each_shape(solids).values()
+    ]
     ends = np.cumsum([len(potential) for potential in potentials])
     arrays.cylinder = put([end - len(p) if len(p) else -1 for end, p in zip(ends, potentials, strict=True)])
     arrays.cylinders = put(np.concatenate(potentials), dtype)

@@ -48,6 +48,7 @@ class SolidMagnet:
     movable: bool  # true if the force on it is computed
     response: float = 0.0  # k = 3χ/(3 + χ) if it responds to fields, else 0
     far_reach: float = 0.0  # distance from which on its moments in the system act alone [m], at least ``reach``
+    potential: Any = None  # its ``shape.potential_table()`` from a cache; None to compute it where cells are near
 
     @property
     def has_few_moments(self) -> bool:

@@ -6,6 +6,7 @@ import numpy as np
 from warpmag.declarations.magnets import LINEAR_CURVE, MagneticSettings
 from warpmag.engine.magnets.equal_worlds import EqualWorlds, kinematic_bodies
 from warpmag.engine.magnets.grouping import BodyMagnet
+from warpmag.engine.magnets.sampling import shape_cache
 from warpmag.kernels.applied.solids import SolidMagnet
 from warpmag.kernels.near_contact.images import IronFaces
 from warpmag.moments.layout import MomentMaterial
@@ -35,8 +36,10 @@ def make_system(
     bodies = [magnet.body if magnet.body >= 0 else k for magnet, k in zip(magnets, static.tolist(), strict=True)]
     kinematic = kinematic_bodies(model).tolist()
     movable = [magnet.body >= 0 and not kinematic[magnet.body] for magnet in magnets]
+    near_cells = any(magnet.lattice.coupling.near for _, magnet in coupled)
+    potentials = _potentials(model, magnets) if near_cells else {}
     solids = [
-        _solid_magnet(k, magnet, can_move, part)
+        _solid_magnet(k, magnet, can_move, part, potentials.get(id(part.shape)))
         for k, magnet, can_move in zip(first, magnets, movable, strict=True)
         for part in magnet.lattice.solids
     ]
@@ -80,14 +83,25 @@ def _iron_faces(number: int, first: int, magnet: BodyMagnet) -> IronFaces:
     return IronFaces(number, first, count, magnet.world, lattice.positions[0], faces.planes, faces.edges)
 
 
-def _solid_magnet(first: int, magnet: BodyMagnet, movable: bool, part) -> SolidMagnet:
+def _potentials(model: newton.Model, magnets: list[BodyMagnet]) -> dict[int, np.ndarray]:
+    """Return the tables of the potential of cylinders by the identity of their shape, from the cache of shapes."""
+    shapes = {id(part.shape): (part.shape, magnet) for magnet in magnets for part in magnet.lattice.solids}
+    tables = {}
+    for key, (shape, magnet) in shapes.items():
+        if (cylinder := shape.cylinder) is not None:
+            of = "potential", cylinder.radius, cylinder.half_height, cylinder.center, cylinder.axis
+            name = f"{model.shape_label[magnet.shapes[0]]}: potential"
+            tables[key] = shape_cache().get(name, of, shape.potential_table)
+    return tables
+
+
+def _solid_magnet(first: int, magnet: BodyMagnet, movable: bool, part, potential) -> SolidMagnet:
     """Return the record of a part with a closed form. ``first`` is the first moment of its magnet in the system."""
     # the response of recoil, 3χ/(3 + χ) = 3 (μ − 1)/(μ + 2)
     lattice, response = magnet.lattice, 3.0 - 9.0 / (2.0 + magnet.magnet.recoil_permeability)
     volume, first = float(lattice.volumes[part.first]), first + part.first
-    return SolidMagnet(
-        first, part.count, volume, magnet.world, part.reach, part.shape, part.moments, movable, response, part.far_reach
-    )
+    places = first, part.count, volume, magnet.world, part.reach
+    return SolidMagnet(*places, part.shape, part.moments, movable, response, part.far_reach, potential)
 
 
 def _largest_extent(magnets: list[BodyMagnet], bodies: np.ndarray, movable: np.ndarray) -> float:
