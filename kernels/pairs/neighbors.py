@@ -15,9 +15,9 @@ counting sort on a CPU makes the candidates of a target contiguous.
 import math
 from functools import cache
 
+import numpy as np
 import warp as wp
 
-from warpmag.kernels.shared.copies import put_copies
 from warpmag.kernels.shared.native import native_kernel
 from warpmag.kernels.shared.reductions import group_threads, most_blocks
 from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, team, threads_for
@@ -79,8 +79,8 @@ def allocate(count: int, packed, group, *, reach: float, ratio=1.0 + SKIN, capac
     lists = lists_type(dtype)()
     lists.packed, lists.group, lists.ratio = packed, group, ratio
     lists.radius = packed[3] if radii is None else radii
-    own = bodies is None
-    lists.body = put_copies([0], wp.int32, device, count, 1) if own else wp.array(bodies, dtype=wp.int32, device=device)
+    own_bodies = np.arange(count, dtype=np.int32)
+    lists.body = wp.array(own_bodies if bodies is None else bodies, dtype=wp.int32, device=device)
     lists.reach = wp.full(1, reach, dtype=wp.float64, device=device)
     lists.neighbor = (wp.zeros if ratio > 1.0 else wp.empty)((count, capacity), dtype=int, device=device)
     lists.count = wp.zeros(count, dtype=int, device=device)

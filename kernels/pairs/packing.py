@@ -15,7 +15,6 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.pairs import neighbors
-from warpmag.kernels.shared.copies import put_copies
 
 PACKED_ROWS = 8
 PITCH = 128
@@ -103,7 +102,7 @@ class PackedMoments:
             is_array = isinstance(values, wp.array)
             return values if is_array else wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=device)
 
-        self.labels = put_copies([0], wp.int32, device, n, 1) if labels is None else integers(labels)
+        self.labels = integers(np.arange(n, dtype=np.int32) if labels is None else labels)
         self.groups = wp.zeros(n, dtype=wp.int32, device=device) if groups is None else integers(groups)
         pitched = self._whole = self._pitched(PACKED_ROWS)
         pitched[3].fill_(largest_radius)
