@@ -24,8 +24,9 @@ from warpmag.kernels.shared.team import launch_passes, threads_for
 
 WINDOW = 2.5, 3.5
 """Distances at which boxes start to turn into balls and are balls, in means of their sizes: the longest side times the
-root of its ratio to the shortest, less for small cells. Dipoles lack the quadrupole of flat
-cells, and need more distance."""
+root of its ratio to the shortest, less for small cells. Dipoles lack the quadrupole of flat cells, and need more
+distance. With 4.5 and 6 the force between two discs of 40:2 mm has an error of 3 % in place of 5 %, and forces in a
+stack of five 6 to 10 % in place of 7 to 16 %. But then up to five times as many cells are in the lists."""
 _FLATTEST = 3.0
 """Largest ratio of sides that increases a size, that of whole cells at automatic spacing. Flatter cells are parts that
 a surface cuts off, of little volume."""
