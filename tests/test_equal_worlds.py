@@ -10,7 +10,9 @@ import warpmag
 from warpmag.engine.magnets import magnetics as magnetics_module
 from warpmag.engine.magnets.equal_worlds import EqualWorlds, equal_worlds
 from warpmag.engine.magnets.grouping import find_magnets
+from warpmag.errors import InputError
 from warpmag.kernels.shared.copies import put_copies, repeat_rows
+from warpmag.moments.system import MomentSystem
 
 
 def at(*position):
@@ -105,3 +107,12 @@ def test_rows_are_copied_on_the_host_and_on_the_device(device):
     assert put_copies([1.5, -2.5], wp.float64, device, 2).numpy().tolist() == [1.5, -2.5] * 2
     assert put_copies([True, False], wp.bool, device, 2).numpy().tolist() == [True, False] * 2
     assert put_copies([0], wp.int32, device, 0, 1).numpy().tolist() == []
+
+
+def test_copies_of_a_system_are_counted(device):
+    for name, value, message in (("copies", 0, "at least 1"), ("copies", 1.5, "whole"), ("body_step", -1, "negative")):
+        with pytest.raises(InputError, match=f"^{name}: must.*{message}"):
+            MomentSystem(radii=[1.0], device=device, **{name: value})
+    system = MomentSystem(radii=[1.0, 2.0], worlds=[0, 1], bodies=[3, 4], copies=2, body_step=10, device=device)
+    assert system.worlds.tolist() == [0, 1, 2, 3] and system.bodies.numpy().tolist() == [3, 4, 13, 14]
+    assert system.world_ranges == [(0, 1, 1), (1, 2, 2), (2, 3, 3), (3, 4, 4)]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpmag.declarations.checks import check_token
+from warpmag.declarations.checks import check_count, check_token, check_whole
 from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.magnets import LINEAR_CURVE
 from warpmag.errors import InputError
@@ -127,6 +127,10 @@ def _rows(*columns: np.ndarray) -> list[tuple]:
 
 def make_layout(radii, worlds, permanent, bodies, movable, dtype, copies: int = 1, body_step: int = 0) -> MomentLayout:
     """Return the layout of moments; the arguments after the radii may be None, see :class:`MomentSystem`."""
+    check_count("copies", copies)
+    check_whole("body_step", body_step)
+    if body_step < 0:
+        raise InputError(f"body_step: must not be negative, got {body_step}")
     radii = host_radii("radii", radii, dtype)
     if radii.ndim != 1:
         raise InputError(shape_message("radii", "[n]", radii))
