@@ -18,7 +18,7 @@ Once a solve has taken as many evaluations as changes are stored, the newest cha
 iterate, becomes that from the last mixture to s̄, if the iterate is the best so far. The coupling is symmetric, so that
 few such changes are as good as all (conjugate residuals; short-term recurrence of Wei, Bao and Liu 2022). Heaps of
 plates and bars take 26 evaluations in place of 35, and sheets on each other less than half. Mixtures are not evaluated:
-where the iterates do not improve, the changes between them are more precise.
+where the iterates do not improve, or r̄ hardly changes, the changes between iterates are more precise.
 
 A step changes the field most at near neighbors. Sweeps update the neighbors' part without another evaluation of the
 whole field. With the coupling G' of the listed neighbors, two sweeps s ← s + ω' (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s)

@@ -11,6 +11,7 @@ constexpr double WHOLE_STEP = 0.6;     // step length of balls without overlap
 constexpr double SLOWEST = 20.0;       // largest error amplification by slow convergence
 constexpr double LEAST = 0.01;         // lower bound of an error, as a fraction of the last change
 constexpr double REMEMBERED = 0.5;     // fraction of the slowness that is kept at an evaluation
+constexpr double DISTINCT = 0.01; // least change of the residual between mixtures, as a fraction of the last change
 constexpr double ROUNDING = 8.0 * (sizeof(Real) == 4 ? 1.2e-7 : 2.2e-16); // residual at rounding level
 
 // Sums over the moments of a chunk or a world: ‖M − f(H)‖², ‖f(H)‖², ‖φr‖², ‖φ(2 − ω₁)r‖², ‖φΔs‖² of the last
@@ -84,6 +85,23 @@ CUDA_CALLABLE inline bool mix(World& world, const History& history, const double
 // Whether a solve is long: then few stored changes must tell about all earlier ones, so they are those of mixtures.
 template <class World> CUDA_CALLABLE inline bool is_long(const World& world) { return world.evaluations >= DEPTH; }
 
+// Whether the residual of the next mixture differs from that of the last one, by (1 − α₀) Δr₀ − Σ α_a Δr_a, a > 0.
+// Where two moments or so are unknown it does not, and their quotient would be one of rounding errors.
+template <class World> CUDA_CALLABLE inline bool is_distinct(const World& world, const double* sums) {
+    double square = 0.0;
+#pragma unroll
+    for (int a = 0; a < DEPTH; ++a) {
+        const double first = a == 0 ? 1.0 - world.alpha[0] : -world.alpha[a];
+#pragma unroll
+        for (int b = a; b < DEPTH; ++b) {
+            if (b >= world.used) continue;
+            const double second = b == 0 ? 1.0 - world.alpha[0] : -world.alpha[b];
+            square += (a == b ? 1.0 : 2.0) * first * second * sums[PRODUCTS + matrix_column(a, b)];
+        }
+    }
+    return square > DISTINCT * DISTINCT * sums[PRODUCTS + matrix_column(0, 0)];
+}
+
 // Error after the last step over the residual before it, by the estimate of theta_flow.py.
 template <class World>
 CUDA_CALLABLE inline double amplification(const World& world, const double* sums, double merit, bool mixed) {
@@ -120,7 +138,7 @@ template <class State> CUDA_CALLABLE inline void choose_step(State& state, int w
         const double followed = sums[EARLIER] > 0.0 ? sums[FOLLOWED] / sums[EARLIER] : 0.0;
         world.ahead = followed < 0.0 ? 0.0 : followed > 1.0 ? 1.0 : followed;
     }
-    world.changes_mixture = world.has_change && world.is_best && is_long(world);
+    world.changes_mixture = world.has_change && world.is_best && is_long(world) && is_distinct(world, sums);
     int next = done || world.plain_steps > 0 || world.apart > 0 ? STEP : STEP_AND_SWEEP;
     if (!mixed) next = STEP_FROM_BEST;
     if (done && !finite) next = NOTHING;
