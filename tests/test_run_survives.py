@@ -156,6 +156,7 @@ class Survival:
             if self.frames():  # the end may come between a frame and what the run says of it
                 last = max(self.frames())
                 ends = [f", {self.output} has the frames up to {frame}" for frame in (last, last + 1)]
+                ends += ["ended by SIGHUP", "ended by SIGTERM", "interrupted"] if last == FRAMES else []  # a whole run
                 assert line.endswith(tuple(ends))
         return code == 0
 
