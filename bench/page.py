@@ -64,18 +64,18 @@ def sources(data: Machines) -> str:
 
 def steps(data: Machines) -> str:
     """Return the table of the steps of scenes, beside the paper's times and its method on the same machine."""
-    columns = {}
+    programs = {}
     for name, lines in data.items():
         times = {line["scene"]: line["seconds"] for line in _cases(lines, "steps")}
         reruns = {line["scene"]: sum(1e-3 * line[f"t{part}_ms"] for part in "ifr") for line in _cases(lines, "paper")}
-        columns |= {name: times, f"the paper's method, {name}": reruns}
-    columns["paper, Core i7-8700"] = {scene: 1e-3 * sum(PAPERS_TIMES[scene, "paper"]) for scene in _SCENES}
-    columns = {head: times for head, times in columns.items() if times}
+        programs |= {f"warpmag, {name}": times, f"the paper's method, {name}": reruns}
+    programs["the paper, Core i7-8700"] = {scene: 1e-3 * sum(PAPERS_TIMES[scene, "paper"]) for scene in _SCENES}
     rows = [
-        [title, *(duration(times[scene]) if scene in times else "" for times in columns.values())]
-        for scene, title in _SCENES.items()
+        [program, *(duration(times[scene]) if scene in times else "" for scene in _SCENES)]
+        for program, times in programs.items()
+        if times
     ]
-    return _table(["scene", *columns], rows)
+    return _table(["program", *_SCENES.values()], rows)
 
 
 def fields(data: Machines) -> str:
