@@ -19,7 +19,7 @@ def test_heaps_are_stable_and_balanced(device):
 
 
 def test_sweeps_that_diverge_end(device):
-    """Of cells in two balls that overlap: plain steps converge in 45 evaluations. With each second one it took 797."""
+    """Plain steps converge in 45 evaluations where cells lie in two balls that overlap; with sweeps it took 797."""
     number = 643
     heap = heaps.draw(number // heaps.BATCH, 7)[number % heaps.BATCH]
     (verdict,) = heaps.SolvedHeaps([heap], device).verdicts(number)
