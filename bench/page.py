@@ -24,6 +24,8 @@ _SCENES = {
     "sakura_tree": "Sakura Tree, 2,500 balls",
 }
 _OWN = ("warpmag", "h_field")  # names of warpmag among the peers
+_PEERS = {"numba_cpu": "a parallel loop in Numba", "warp_tile": "Warp's example of tiles"}
+"""Names of peers for readers who do not know the benchmark; other peers keep theirs."""
 _GPU = "NVIDIA H200"
 """Machine of the quoted figures."""
 
@@ -120,10 +122,11 @@ def summary(data: Machines) -> str:
         ["step of Sakura Tree, 2,500 balls", *(_time(_cases(x, "steps", scene="sakura_tree")) for x in data.values())],
         ["field of balls on each other, all pairs", *map(_against_peers, data.values())],
         ["field of many moments, error at most 1e-3", *map(_many, data.values())],
-        ["magnetics of many worlds of 64 balls", *map(_many_worlds, data.values())],
+        ["solve and forces in many worlds of 64 balls, without rigid bodies", *map(_many_worlds, data.values())],
     ]
     commits = ", ".join(sorted({lines[0]["commit"] for lines in data.values()}))
-    return _table(["computation", *data], rows) + f"*`python -m bench.all`, commit {commits}.*\n\n"
+    caption = f"*`python -m bench.all`, commit {commits}; [all programs](docs/benchmarks.md).*"
+    return _table(["computation", *data], rows) + caption + "\n\n"
 
 
 def _against_peers(lines: list[dict]) -> str:
@@ -131,7 +134,8 @@ def _against_peers(lines: list[dict]) -> str:
     compared = _cases(lines, "compare", count=largest)
     peer = min((line for line in compared if line["peer"] not in _OWN), key=lambda line: line["seconds"])
     own = _cases(compared, "compare", peer="warpmag")
-    return f"{largest:,} balls: {_time(own)}; the best other program, `{peer['peer']}`: {_time([peer])}"
+    name = _PEERS.get(peer["peer"], f"`{peer['peer']}`")
+    return f"{largest:,} balls: {_time(own)}; fastest other program, {name}: {_time([peer])}"
 
 
 def _many(lines: list[dict]) -> str:
@@ -142,7 +146,7 @@ def _many(lines: list[dict]) -> str:
 
 def _many_worlds(lines: list[dict]) -> str:
     (line,) = _cases(lines, "worlds")
-    return f"{line['worlds']:,} worlds: {_rate(line)} world steps per second"
+    return f"{line['worlds']:,} worlds: {_rate(line)} steps per second, summed over worlds"
 
 
 def _rate(line: dict) -> str:
@@ -158,9 +162,9 @@ def rate_of_worlds(data: Machines) -> str:
 
 
 def largest_field(data: Machines) -> str:
-    """Return the largest field of all pairs on the GPU: the number of moments and the time."""
+    """Return the largest field of all pairs on the GPU: the number of balls and the time."""
     line = max(_cases(data[_GPU], "compare", peer="warpmag"), key=lambda line: line["count"])
-    return f"{line['count']:,} moments in {_time([line])}"
+    return f"{line['count']:,} balls in {_time([line])}"
 
 
 TABLES = {
