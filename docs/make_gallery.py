@@ -48,6 +48,8 @@ VIEWS = {
 PITCHES = {"worlds": (0.034, 0.0, 0.0), "compass_swarm": (0.0, 0.03, 0.0)}
 """Distance of neighboring worlds in pictures [m]."""
 SLOW = {"levitation": 5, "worlds": 3}
+NOTES = {"levitation": " (slow motion)", "worlds": " (slow motion of five worlds)"}
+"""Ends of captions."""
 """Numbers of frames of examples that move for milliseconds only: a picture of each step, in slow motion."""
 _RATE = 25.0  # pictures per second of slow motion
 _MOST = 40
@@ -186,7 +188,7 @@ def page() -> str:
     examples_of = [
         (
             f"python -m warpmag.examples {name}",
-            line.rstrip(".") + " (slow motion)" * (name in SLOW),
+            line.rstrip(".") + NOTES.get(name, ""),
             name,
         )
         for name, line in examples.get_examples().items()
