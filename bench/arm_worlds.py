@@ -270,7 +270,8 @@ def draw(lines: list[dict], path: Path) -> None:
     of_part = {part: [line for line in lines if line["part"] == part] for part in PARTS}
     for case in CASES:
         points = [line for line in of_part["gaps"] if (line["object"], line["contact_model"]) == case and line["gap"]]
-        gaps, label = [1e3 * line["gap"] for line in points], ", ".join(case)
+        gaps = [1e3 * line["gap"] for line in points]
+        label = ", ".join(case) if case[0] == "balls" else case[0]  # the contact model acts on balls
         (curve,) = cost.plot(gaps, [line["magnetics_ms"] for line in points], marker=".", label=label)
         style = {"color": curve.get_color(), "marker": "."}
         if case[1] == "dipole":
