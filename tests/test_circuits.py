@@ -1,4 +1,4 @@
-"""Coils with voltages: closed forms of circuits, reference inductances, energy, graphs, worlds and errors."""
+"""Coils with a resistance: closed forms of circuits, reference inductances, energy, graphs, worlds and errors."""
 
 import math
 
@@ -23,7 +23,7 @@ LOOP = {"radius": 0.01}
 
 
 def coil_and_ball(coil, *, position=(0.0, 0.0, 5.0), magnet=None, **circuit):
-    """Builder of a coil with a voltage and a ball, by default far away: iron or with the given magnetization."""
+    """Builder of a coil with a resistance and a ball, by default far away: iron or with the given magnetization."""
     builder = new_builder(gravity=(0.0, 0.0, 0.0))
     body = builder.add_body(xform=wp.transform(position, wp.quat_identity()))
     builder.add_shape_sphere(body, radius=MAGNET)
@@ -299,10 +299,10 @@ def test_misused_circuits_are_errors(device):
     warpmag.add_coil(without, **LOOP, resistance=1.0, turns=5, label="lone")
     for world in (coil_and_ball(LOOP), without):
         lone.add_world(world)
-    with pytest.raises(warpmag.InputError, match="lone: a coil with a voltage in a world without magnets"):
+    with pytest.raises(warpmag.InputError, match="lone: a coil with a resistance in a world without magnets"):
         warpmag.Magnetics(lone.finalize(device=device))
     everywhere = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     everywhere.replicate(coil_and_ball(LOOP), 2)
     warpmag.add_coil(everywhere, **LOOP, resistance=1.0, turns=5, label="outside")
-    with pytest.raises(warpmag.InputError, match="outside: a coil with a voltage outside all worlds"):
+    with pytest.raises(warpmag.InputError, match="outside: a coil with a resistance outside all worlds"):
         warpmag.Magnetics(everywhere.finalize(device=device))

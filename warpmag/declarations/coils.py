@@ -79,7 +79,7 @@ def checked_vectors(name: str, values: Any, most: float) -> np.ndarray:
 
 
 class Circuit(NamedTuple):
-    """Winding of a coil with a voltage."""
+    """Winding of a coil with a resistance."""
 
     turns: float  # number of turns
     resistance: float  # of the winding and its supply [Ω]
@@ -93,7 +93,7 @@ class SourceRecord:
     kind: str  # name of a ``kernels.applied.sources.SourceKind``, in lower case
     parameters: tuple[float, ...]  # numbers of the kind
     table: np.ndarray  # vectors of the kind, shape [k, 3]
-    circuit: Circuit | None = None  # of a coil with a voltage, None where the current is given
+    circuit: Circuit | None = None  # of a coil with a resistance, None where the current is given
 
     def to_text(self) -> str:
         """Return the record as a line of text that keeps every bit of its numbers."""

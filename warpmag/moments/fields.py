@@ -50,10 +50,11 @@ def h_field(
     """Return the field H of magnetic moments (Kim and Han 2022, Eq. 1).
 
     Moments with a radius are uniformly magnetized balls. If a ball overlaps the target's ball, the field is averaged
-    over the target. The field excludes a moment's own field, and point dipoles at the target itself: at a distance
-    of zero, or of less than about 1e-19 m in float32.
+    over the target. The field excludes a moment's own field. It also excludes point dipoles at a distance of
+    zero from the target (in float32, below about 1e-19 m).
 
-    Warp arrays with ``requires_grad`` are differentiated on an active ``wp.Tape``: positions, moments and targets.
+    On an active ``wp.Tape`` the result has gradients with respect to Warp arrays with ``requires_grad``: positions,
+    moments and targets.
 
     Args:
         positions: Moment positions [m], shape [n, 3], NumPy or Warp.
@@ -62,7 +63,8 @@ def h_field(
         radii: Ball radii [m], scalar or [n]; None means point dipoles.
         target_radii: Radii [m] of the balls at the targets over which the field is averaged, scalar or [t]; None means
             points.
-        smoothing: Smoothing length ℓ [m] of section 5, which adds ε² = ℓ⁵ to r⁵; point dipoles only.
+        smoothing: Smoothing length ℓ [m], for point dipoles only: r⁵ becomes r⁵ + ℓ⁵, where ℓ⁵ is ε² of section 5 of
+            Kim and Han 2022.
         method: ``direct``: native loops over all pairs. ``reference``: a plain Warp loop. ``fmm``: the fast multipole
             method. ``auto``: the fastest method that is exact to rounding, or that meets ``rtol`` if given.
         rtol: Largest relative error ‖H − H_exact‖/‖H_exact‖ over all targets. None means 1e-3 with ``fmm``, else
@@ -74,8 +76,8 @@ def h_field(
         H [A/m], shape [t, 3], as NumPy array, or as Warp array of vectors if ``positions`` is a Warp array.
 
     Raises:
-        InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (see
-            ``warpmag.moments.arrays``), or the result is not finite. Or a tape is active, and an argument requires a
+        InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (the
+            message has the limits), or the result is not finite. Or a tape is active, and an argument requires a
             gradient that does not exist.
 
     Example:
@@ -145,8 +147,8 @@ def wrench(
     F = μ0 (m·∇)H (Kim and Han 2022, Eqs. 13 and 14) and τ = μ0 m × H. The mutual forces and torques conserve linear and
     angular momentum. Point dipoles at zero distance do not act on each other.
 
-    Warp arrays with ``requires_grad`` are differentiated on an active ``wp.Tape``: positions, moments and the external
-    field.
+    On an active ``wp.Tape`` the results have gradients with respect to Warp arrays with ``requires_grad``: positions,
+    moments and the external field.
 
     Args:
         positions: Moment positions [m], shape [n, 3], NumPy or Warp.
@@ -164,8 +166,8 @@ def wrench(
         Forces [N] and torques about each moment's position [N·m], each of shape [n, 3], NumPy or Warp as ``positions``.
 
     Raises:
-        InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (see
-            ``warpmag.moments.arrays``), or a result is not finite. Or a tape is active, and an argument requires a
+        InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (the
+            message has the limits), or a result is not finite. Or a tape is active, and an argument requires a
             gradient that does not exist.
 
     Example:

@@ -176,17 +176,18 @@ def solve_induction(
     Balls may overlap. With the contact model ``dipole`` and sums over all pairs the solution is unique for any
     arrangement.
 
-    Warp arrays with ``requires_grad`` are differentiated on an active ``wp.Tape``: positions, radii, saturation,
-    susceptibility, points of a curve, external field and permanent moments with their positions.
+    On an active ``wp.Tape`` the result has gradients with respect to Warp arrays with ``requires_grad``: positions,
+    radii, saturation, susceptibility, points of a curve, external field and permanent moments with their positions.
 
     Args:
         positions: Ball centers [m], shape [n, 3], NumPy or Warp.
         radii: Ball radii [m], scalar or [n].
         saturation: Saturation magnetization Ms [A/m], scalar or [n]; required unless all curves are measured.
         susceptibility: Susceptibility [dimensionless], scalar or [n], may be infinite.
-        curve: Magnetization curve: one of ``magnets.CURVES``, a measured :class:`warpmag.MagnetizationCurve`, or the
-            name of a material with a measured curve. Measured curves have their own saturation and susceptibility. A
-            tuple or list of n gives each ball its own curve.
+        curve: Formula of the magnetization curve, ``tanh``, ``langevin``, ``clamped``, ``frohlich`` or
+            ``tanh-applied``. Or a measured curve: a :class:`warpmag.MagnetizationCurve`, or the name of a material that
+            has one. Measured curves have their own saturation and susceptibility. A tuple or list of n gives each ball
+            its own curve.
         curve_points: Points of a measured curve of all balls in place of ``curve``: (fields H inside [A/m],
             magnetizations M [A/m]), each of shape [points], as :meth:`warpmag.MagnetizationCurve.from_mh`.
         external_field: Applied field H0 [A/m], shape [3] or [n, 3].
@@ -209,8 +210,8 @@ def solve_induction(
         The equilibrium, an :class:`InductionResult`.
 
     Raises:
-        InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (see
-            ``warpmag.moments.arrays``), or the result is not finite. Or a tape is active, and an argument requires a
+        InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (the
+            message has the limits), or the result is not finite. Or a tape is active, and an argument requires a
             gradient that does not exist.
 
     Warns:

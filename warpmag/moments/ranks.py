@@ -119,9 +119,9 @@ def compare_arguments(function: Callable[_P, _R]) -> Callable[_P, _R]:
 def sweep(simulate: Callable[[range], _R], world_count: int, *, together: int) -> list[_R]:
     """Simulate many worlds in groups, which the ranks of ``mpirun`` share.
 
-    Each rank simulates its groups on its own. At the end all ranks receive all results. Worlds of one model may share
-    substeps and the form of their sums, so results may depend on the groups. The groups do not depend on the number of
-    ranks: results are bitwise identical to a single process, on any device.
+    Each rank simulates its groups on its own. At the end all ranks receive all results. Worlds of a group may share
+    substeps and the method of summation, so results may depend on ``together``. They do not depend on the number of
+    ranks: they are bitwise identical to those of a single process if ``simulate`` itself repeats bit by bit.
 
     Args:
         simulate: Function that takes the range of the worlds of a group. Its result is sent to all ranks and must be

@@ -32,9 +32,9 @@ def export(
 ) -> list[str]:
     """Export a scene, or the recording of a run.
 
-    Positions are those of the stage, bitwise in single precision. ``.npz`` and ``.csv`` contain the recording in SI
-    units and take no options. ``.html`` is one web page that plays the motion from any side without a network, in the
-    colors of the materials, without textures.
+    Positions equal those of the stage bit by bit in single precision. ``.npz`` and ``.csv`` contain the recording in SI
+    units and take no options. ``.html`` is one web page that plays the motion without a network, seen by a camera that
+    the user moves. It shows the colors of the materials or of ``color``, but no textures.
 
     Args:
         stage: USD file.

@@ -36,9 +36,9 @@ def no_viewer(name: str, error: Exception) -> InputError:
 class Display:
     """A model with its magnets in one of Newton's viewers.
 
-    Every magnetic shape has an arrow along its magnetization. Length and color of the arrow, from violet over green to
-    yellow, follow the magnetization over the largest one in the frame. The camera of ``gl``, ``viser`` and ``rtx``
-    starts where it sees all bodies.
+    Every magnetic shape has an arrow along its magnetization. The length and the color of an arrow, from violet through
+    green to yellow, show its magnetization divided by the largest one in the frame. The camera of ``gl``, ``viser`` and
+    ``rtx`` starts where it sees all bodies.
 
     Attributes:
         viewer: The viewer.

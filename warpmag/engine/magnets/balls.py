@@ -61,16 +61,16 @@ def add_balls(
 ) -> Balls:
     """Add many free balls, each one a magnet.
 
-    The result equals calls of ``add_body``, ``add_shape_sphere`` and :func:`add_inducible` or :func:`add_permanent` for
-    each ball, and takes a few microseconds per ball. ``builder.default_shape_cfg`` sets all other shape properties.
+    Equivalent to calls of ``add_body``, ``add_shape_sphere`` and :func:`add_inducible` or :func:`add_permanent` for
+    each ball, but much faster. ``builder.default_shape_cfg`` sets all other shape properties.
 
     Args:
         builder: The builder, with :func:`register_custom_attributes` called on it.
         positions: Centers [m], shape [n, 3].
         radius: Radius [m], one number or shape [n].
         orientations: Rotations, unit quaternions x y z w, shape [n, 4]; by default the identity.
-        density: Density [kg/m³]; by default that of ``builder.default_shape_cfg``, or of ``material`` if that is
-            Newton's default.
+        density: Density [kg/m³]; by default the density of ``builder.default_shape_cfg``. If this is Newton's default
+            and ``material`` is given, the density of the material.
         friction: Coefficient of friction [dimensionless].
         material: Name of a material of :mod:`warpmag.declarations.materials`: inducible, or permanent with a
             ``direction``.
@@ -88,6 +88,9 @@ def add_balls(
 
     Raises:
         InputError: The attributes are not declared, a position or a value is out of range, or lengths of arrays differ.
+
+    Warns:
+        UnitWarning: The magnetization is not that of a real magnet, or a radius is likely in another unit.
 
     Example:
         >>> import newton

@@ -1,4 +1,4 @@
-"""Coils with voltages on a Newton model: their circuits, and the arrays of their state."""
+"""Coils with a resistance on a Newton model: their circuits, and the arrays of their state."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -41,7 +41,7 @@ class CoilCircuits:
         for k in circuits:
             if applied[k].world < 0:
                 label = model.shape_label[shapes[k]]
-                raise InputError(f"{label}: a coil with a voltage outside all worlds, while several hold magnets")
+                raise InputError(f"{label}: a coil with a resistance outside all worlds, while several hold magnets")
         circuits.sort(key=lambda k: (applied[k].world, shapes[k]))
         self._system, self._attributes = system, getattr(model, NAMESPACE)
         self.shapes = [shapes[k] for k in circuits]

@@ -39,7 +39,7 @@ def add_inducible(
     moment_spacing: float = 0.0,
     conductivity: float = 0.0,
 ) -> list[int]:
-    """Make bodies, or single shapes, magnets that the field magnetizes: iron, steel, ferrite.
+    """Mark bodies, or single shapes, as inducible magnets: iron, steel or soft ferrite.
 
     Args:
         builder: The builder, with :func:`register_custom_attributes` called on it.
@@ -52,15 +52,16 @@ def add_inducible(
             Newton's default density gets the material's.
         saturation: Saturation magnetization Ms [A/m], 1.7e6 by default.
         susceptibility: Susceptibility χ [dimensionless], infinite by default.
-        curve: Magnetization curve: one of ``magnets.CURVES``, ``tanh`` by default, or a measured curve: a
-            :class:`warpmag.MagnetizationCurve` or the name of a material with a measured curve. A measured curve
-            replaces saturation and susceptibility. A formula is a function of the field of all other sources for
-            a ball of one moment, and of the field inside for other shapes. ``tanh-applied`` is a function of the field
-            of all other sources for both.
+        curve: Formula of the magnetization curve, ``tanh`` (default), ``langevin``, ``clamped``, ``frohlich`` or
+            ``tanh-applied``. Or a measured curve: a :class:`warpmag.MagnetizationCurve`, or the name of a material that
+            has one. A measured curve replaces saturation and susceptibility. For a ball of one moment, a formula is a
+            function of the external field plus the fields of all other sources; for other shapes, of the field inside.
+            ``tanh-applied`` is a function of the former field for all shapes.
         moment_spacing: Distance between sampled moments [m]; 0 means one moment for a ball, automatic otherwise.
-        conductivity: Electrical conductivity [S/m] of a ball of one moment, its body's only magnet. Eddy currents brake
-            a conductor that moves through the field. 0 means no eddy currents. ``material`` does not set it, since eddy
-            currents cost a sum over pairs; :class:`warpmag.declarations.materials.Material` lists values.
+        conductivity: Electrical conductivity [S/m]. Eddy currents brake a conductor that moves through the field. Only
+            a ball of one moment that is the only magnet of its body can conduct; :class:`warpmag.Magnetics` raises an
+            error for others. 0 means no eddy currents. ``material`` does not set it, since eddy currents cost a sum
+            over pairs; :class:`warpmag.declarations.materials.Material` lists values.
 
     Returns:
         Indices of the shapes that became magnets.

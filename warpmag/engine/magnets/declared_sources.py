@@ -69,8 +69,8 @@ def add_coil(
         turns: Number of turns; a coil with a resistance needs it.
         inductance: Inductance of a coil with a resistance, in air [H]. By default computed from the geometry:
             all turns in the wire of a loop or a polyline, or in the sheet of a solenoid. The smallest valid value is a
-            hundredth of the computed one. The coupling of coils on a body is reduced where a smaller inductance
-            would make the energy of some currents negative.
+            hundredth of the computed one. If given inductances are too small for the computed mutual inductances, the
+            mutual inductances are reduced, so that the magnetic energy cannot be negative.
         xform: Pose of the coil in the frame of the body, or in the world.
         label: Label of the coil, by which :meth:`warpmag.Magnetics.set_current` finds it.
 

@@ -51,9 +51,10 @@ from warpmag.terminal import collection_paused
 class Magnetics:
     """The magnets of a Newton model: their induction, forces and fields.
 
-    A ball is one moment. Any other shape is a lattice of moments with the exact volume, or fewer moments where every
-    other magnet is far away. Moments of one body exert no forces on each other, and magnets of different worlds do not
-    interact. Use any solver that reads ``State.body_f``::
+    A ball without a ``moment_spacing`` is one moment. Most permanent boxes and cylinders are 4 to 8 moments with a
+    closed-form near field. Any other magnet is a lattice of moments with the exact volume; iron acts by fewer moments
+    if it is far from all other magnets. Moments of one body exert no forces on each other, and magnets of different
+    worlds do not interact. Use any solver that reads ``State.body_f``::
 
         magnetics = warpmag.Magnetics(model)
         ...
@@ -63,12 +64,14 @@ class Magnetics:
 
     Attributes:
         magnets: The magnets, in the order of their moments.
-        system: The moments on the device. Where bodies act by few moments, call its ``refresh`` before its
-            ``positions`` and ``moments`` are read; measurements of fields and :meth:`sum_moments` do so.
+        system: The moments on the device. If its ``refresh`` is not None, call it before reading its ``positions`` and
+            ``moments``: a distant body may have acted by fewer moments, in another system. Probes and
+            :meth:`sum_moments` call it themselves.
         shapes: Indices of the magnetic shapes, in the order of :meth:`shape_moments`, shape [n].
         shape_volumes: Magnetic volume of each of these shapes [m³], shape [n]. Where shapes of one body overlap, the
             common volume belongs to the first of them.
-        coils: The coils with voltages, None without any: their ``labels``, and on the device their ``currents`` [A].
+        coils: The coils with a resistance, None without any: their ``labels``, and on the device their ``currents``
+            [A].
 
     Example:
         >>> import newton
@@ -124,8 +127,8 @@ class Magnetics:
                 body within this time.
 
         Raises:
-            InputError: The model has no magnets, a setting is out of range, or a magnet outside all worlds would act
-                in several.
+            InputError: The model has no magnets, a setting is out of range, or several worlds have magnets and another
+                magnet is outside all worlds.
         """
         self._held = held_by_model(model)
         imported = None
@@ -166,7 +169,7 @@ class Magnetics:
 
     @property
     def _systems(self) -> list[MomentSystem]:
-        """The system, and those with few moments in place of cells."""
+        """The system, and those with fewer moments in place of cells."""
         return [self.system] if self._distant is None else self._distant.systems
 
     @property
@@ -260,24 +263,24 @@ class Magnetics:
     def apply(self, state: newton.State, dt: float | None = None) -> None:
         """Add the magnetic forces at the poses of ``state`` to ``state.body_f``; capturable in a graph.
 
-        On an active ``wp.Tape`` the forces are differentiated by each of these arrays that requires a gradient:
+        On an active ``wp.Tape`` the forces have gradients with respect to each of these arrays with ``requires_grad``:
         ``state.body_q``, ``model.shape_transform`` (placement of coils that no body carries),
         ``model.warpmag.strength`` (currents), ``model.warpmag.magnetization`` and :attr:`external_field`.
 
         Args:
             state: State with poses ``body_q``. Forces are added to ``body_f``, which is not cleared. Conducting magnets
                 also need velocities, ``body_qd``.
-            dt: Time for which the forces act [s], the time step of the solver. The currents of coils with voltages
+            dt: Time for which the forces act [s], the time step of the solver. The currents of coils with a resistance
                 advance by it; a model with such coils needs it.
 
         Raises:
-            InputError: ``model.warpmag`` has changed, see :meth:`notify_model_changed`; with a GPU some calls later.
-                Or a ``wp.Tape`` is active, ``body_q`` requires a gradient, and the forces have no gradient. Or
-                ``dt`` is missing or not positive.
+            InputError: ``model.warpmag`` has changed without :meth:`notify_model_changed`. On a GPU a later call raises
+                this error, because this method does not wait for the device. Or a ``wp.Tape`` is active, ``body_q``
+                requires a gradient, and the forces have no gradient. Or ``dt`` is missing or not positive.
 
         Warns:
-            ConvergenceWarning: ``max_evaluations`` did not reach ``rtol``. With a GPU only methods that return arrays
-                to the host warn, because this one does not wait; see :attr:`converged`.
+            ConvergenceWarning: ``max_evaluations`` did not reach ``rtol``. On a GPU only methods that return arrays to
+                the host warn; see :attr:`converged`.
         """
         if dt is None and self.coils is not None:
             raise InputError(f"apply: dt is missing, by which the current of {self.coils.labels[0]} advances")
@@ -298,8 +301,9 @@ class Magnetics:
 
         Args:
             state: State with poses ``body_q``.
-            dt: Time [s] by which the currents of coils with voltages advance; by default they stay.
-            sharing: Number of substeps for which the currents advance, at least 2, on the device, int32, shape [1].
+            dt: Time [s] by which the currents of coils with a resistance advance; by default they stay.
+            sharing: Number n ≥ 2 of substeps of length ``dt`` that share this solve; the currents advance by n·dt. On
+                the device, int32, shape [1].
 
         Raises:
             InputError: An argument has a wrong type, size or device, or ``dt`` is not positive.
@@ -337,7 +341,8 @@ class Magnetics:
     def notify_model_changed(self, flags: newton.ModelFlags | int = newton.ModelFlags.SHAPE_PROPERTIES) -> None:
         """Read changed saturations and susceptibilities from ``model.warpmag``; captured graphs stay valid.
 
-        Without this call the next step raises an error. Changes of magnetizations need no call.
+        Without this call a later :meth:`apply` raises an error, on a CPU the next one. Changes of magnetizations need
+        no call.
 
         Args:
             flags: Kinds of changes, as for Newton's solvers. Nothing happens without ``SHAPE_PROPERTIES``.
@@ -367,7 +372,7 @@ class Magnetics:
         return self.system.persistent_arrays() | {f"few.{name}": array for name, array in few.items()}
 
     def stepped_arrays(self) -> list[wp.array]:
-        """Return the arrays that advance by ``dt`` in :meth:`induce`; restoring them repeats the step."""
+        """Return the arrays that :meth:`induce` advances by ``dt``; restore copies of them to repeat a step."""
         return [] if self.coils is None else self.coils.stepped_arrays()
 
     def check_model(self) -> None:
@@ -375,11 +380,11 @@ class Magnetics:
         self._values.check(wait=True)
 
     def set_external_field(self, external_field: Numbers) -> None:
-        """Set the uniform applied field. Capturable in a graph with a Warp array.
+        """Set the uniform applied field; capturable in a graph with a Warp array.
 
         Args:
-            external_field: H0 [A/m], world frame, shape [3] for all worlds, or [worlds, 3]. Or a Warp array of vectors
-                on the model's device, shape [1] or [worlds]; its values are not checked.
+            external_field: H0 [A/m], world frame, shape [3] for all worlds, or [model.world_count, 3]. Or a Warp array
+                of vectors on the model's device, shape [1] or [model.world_count]; its values are not checked.
 
         Raises:
             InputError: The field has another shape, or is not finite.
@@ -389,10 +394,11 @@ class Magnetics:
         set_external_field(field, self._newton_world, self.system.external_field)
 
     def set_current(self, coil: int | str, ampere_turns: Numbers) -> None:
-        """Set the current of coils. After a first call capturable in a graph with a Warp array.
+        """Set the current of coils.
 
-        The values are written to ``model.warpmag.strength``, where a program may write as well. For a field map, the
-        value is the factor of its field.
+        A graph can capture a call with a Warp array, after a first call for the same ``coil``. The values are
+        written to ``model.warpmag.strength``, where a program may write as well. For a field map, the value is the
+        factor of its field.
 
         Args:
             coil: Index of the coil's shape in the model, or a pattern of labels as in a shell. The index is the return
@@ -403,14 +409,15 @@ class Magnetics:
 
         Raises:
             InputError: No coil matches, the numbers of values and coils differ, or a value is not finite. Or a coil has
-                a voltage, see :meth:`set_voltage`.
+                a resistance: use :meth:`set_voltage`.
         """
         self._sources.set_strength("set_current", coil, ampere_turns)
 
     def set_voltage(self, coil: int | str, voltage: Numbers) -> None:
-        """Set the voltage of coils with a resistance. After a first call capturable in a graph with a Warp array.
+        """Set the voltage of coils with a resistance.
 
-        The values are written to ``model.warpmag.voltage``, where a program may write as well. Read the currents from
+        A graph can capture a call with a Warp array, after a first call for the same ``coil``. The values are
+        written to ``model.warpmag.voltage``, where a program may write as well. Read the currents from
         ``coils.currents``.
 
         Args:
@@ -425,7 +432,7 @@ class Magnetics:
         self._sources.set_voltage("set_voltage", coil, voltage)
 
     def set_magnetization(self, magnetization: Numbers, *, body: int = -1, shape: int | None = None) -> None:
-        """Set the magnetization of a permanent magnet. Capturable in a graph with a Warp array.
+        """Set the magnetization of a permanent magnet; capturable in a graph with a Warp array.
 
         The value is written to ``model.warpmag.magnetization``, in the frame of each shape, where a program may write
         as well.
@@ -462,8 +469,8 @@ class Magnetics:
             gradients: Compute gradients as well.
 
         Raises:
-            InputError: A point is not finite or too far away (see ``warpmag.moments.arrays``), or its world holds no
-                magnets.
+            InputError: A point is not finite, a coordinate exceeds 1e7 m or 1e9 times the largest radius of a moment,
+                or the world of a point holds no magnets.
         """
         system = self.system
         context = CallContext(system.device, system.dtype, warp_out=False)
@@ -496,11 +503,12 @@ class Magnetics:
         return probe
 
     def workload(self) -> Workload:
-        """Return the time of a step by part, body and world, with the moments and near cells of each body.
+        """Return the time of each part of a step, and an estimate of it for each body and world.
 
-        Parts of the last solve are launched again on their own, on a GPU in graphs. The time of a body is estimated
-        from its share of moments, of pairs and of cells near permanent magnets. Bodies that act by few moments in all
-        worlds are listed with these moments. The last solve is kept. Waits for the device::
+        Parts of the last solve, such as neighbor search and field evaluations, are launched again on their own, on a
+        GPU in graphs. The time of a body is estimated from its share of moments, of pairs, and of near cells: cells on
+        which a permanent magnet nearby acts by averages. Bodies that act by fewer moments in all worlds are listed with
+        these moments. The last solve is kept. Waits for the device::
 
             magnetics.apply(state)
             print(magnetics.workload())

@@ -31,7 +31,7 @@ class ModelSources:
     Attributes:
         shapes: Shapes that represent sources, in the order of ``applied``.
         applied: The sources as a :class:`MomentSystem` takes them.
-        circuits: Coils with voltages, None without any; set by :meth:`bind`.
+        circuits: Coils with a resistance, None without any; set by :meth:`bind`.
         on_device: Their shapes and bodies, after :meth:`bind`.
     """
 
@@ -47,7 +47,7 @@ class ModelSources:
             record = records.get(texts[shape]) or SourceRecord.from_text(texts[shape])
             records[texts[shape]] = record
             if world is None and record.circuit is not None:
-                raise InputError(f"{model.shape_label[shape]}: a coil with a voltage in a world without magnets")
+                raise InputError(f"{model.shape_label[shape]}: a coil with a resistance in a world without magnets")
             if world is None:
                 continue
             body = int(bodies[shape])
@@ -96,7 +96,7 @@ class ModelSources:
         """Set the strengths of the sources that match a shape index or a shell pattern of labels.
 
         ``value`` is one strength for all of them, or one for each, in the order of their shapes. Messages begin with
-        ``name``. Coils with voltages raise :class:`InputError`.
+        ``name``. Coils with a resistance raise :class:`InputError`.
         """
         shapes = self._matching(name, selector, driven=False)
         set_strengths(self._numbers(name, value, len(shapes)), shapes, self.on_device.strengths)

@@ -77,11 +77,12 @@ class KeyedCurrents:
 
     Coils with a resistance have time-sampled voltages in place of currents.
 
-    ``Simulation`` sets all keyed values of a stage itself. ``KeyedCurrents`` sets coils only: ``add_usd`` imports
-    motions and magnetizations at the start of the stage, without keys. Replicated worlds share keys.
+    ``Simulation`` applies all time samples of a stage itself. This class applies only those of coils: ``add_usd``
+    imports poses and magnetizations at the start of the stage, without their time samples. Replicated worlds share the
+    time samples.
 
     Attributes:
-        shapes: Shape indices of the coils with keys.
+        shapes: Shape indices of the coils with time samples.
         time: Time since the start of the stage [s], on the device, float64, shape [1].
 
     Example:
@@ -106,13 +107,13 @@ class KeyedCurrents:
     """
 
     def __init__(self, model: newton.Model):
-        """Copy the keys to the device, and set the currents at the start.
+        """Copy the time samples to the device, and set the currents at the start.
 
         Args:
             model: A finalized model.
 
         Raises:
-            InputError: No coil of the model has keys.
+            InputError: No coil of the model has time samples.
         """
         held_by_model(model)
         texts = getattr(getattr(model, NAMESPACE, None), "current_keys", None) or ()

@@ -47,7 +47,7 @@ class Simulation:
         simulation = warpmag.Simulation("balls_up.usda")
         statistics = simulation.run(60, output="out.usda")
 
-    A program may also step by itself, with a USD file or a ``newton.ModelBuilder``::
+    A program may also call :meth:`step` itself. The scene is a USD file or a ``newton.ModelBuilder``::
 
         simulation = warpmag.Simulation(builder, dt=1e-3)
         for _ in range(1000):
@@ -98,11 +98,11 @@ class Simulation:
         """Import the scene and prepare the first step.
 
         Args:
-            scene: USD file, or a builder with magnets. The builder gets the articulations and colors that
-                ``solver`` needs.
+            scene: USD file, or a builder with magnets. The builder is modified: it gets the articulations and the graph
+                coloring that ``solver`` needs.
             dt: Time step [s]; by default the stage's, else 1 ms. Fast motion splits it into substeps.
-            solver: Newton's solver: ``xpbd``, ``steel``, ``mujoco``, ``semi-implicit``, ``featherstone``, ``kamino`` or
-                ``vbd``.
+            solver: Rigid-body solver: ``xpbd``, Newton's XPBD adapted to many bodies in contact, or one of Newton's:
+                ``steel``, ``mujoco``, ``semi-implicit``, ``featherstone``, ``kamino`` or ``vbd``.
             force: ``kelvin`` or ``zeeman``; by default the stage's, else ``kelvin``.
             dynamics: ``theta``, ``theta-euler``, ``llg`` or ``llg-damping``; by default the stage's, else ``theta``.
             contact_model: ``dipole`` or ``multipole``; by default the stage's, else ``dipole``, with which two balls
@@ -112,9 +112,10 @@ class Simulation:
             max_evaluations: Field evaluations after which an unconverged induction solve ends.
             external_field: Uniform applied field H0 [A/m]; by default the stage's, else that of an imported MJCF (see
                 :class:`warpmag.Magnetics`), else none.
-            curve: Magnetization curve of all magnets, one of ``magnets.CURVES``; by default each magnet's own.
+            curve: Magnetization curve of all magnets, see :func:`warpmag.add_inducible`; by default each magnet's own.
             device: Warp device; by default Warp's.
-            graphs: Replay captured graphs, in place of launching each kernel; by default True without ``on_substep``.
+            graphs: Replay captured graphs, in place of launching each kernel; by default True, or False with
+                ``on_substep``. If a capture fails, kernels are launched one by one; see :attr:`capture_failure`.
             visuals: Also import visual shapes that do not collide, for a viewer.
             on_substep: Function of a state and the length of a substep [s], called in each substep after the magnetic
                 forces: it adds its own to ``state.body_f``, or sets ``simulation.control``. A substep may be repeated,
@@ -346,8 +347,8 @@ class Simulation:
 
         Args:
             frames: Output frames after the first; by default the whole stage, else one second.
-            output: USD file to write. From a builder it lacks passive springs and, with a warning, joints of several
-                axes.
+            output: USD file to write. Passive springs of a builder are not written, nor, with a warning, its joints of
+                several axes.
             copy_scene: Copy the scene beside the output instead of referencing it. A scene with unsaved edits is always
                 copied.
             resume: Continue the run at the output, if there is one; scene and options must be the same. On a CPU the
@@ -392,7 +393,7 @@ class Simulation:
         return self.finish()
 
     def frames_of(self, frames: int | None) -> int:
-        """Return the number of frames of a run, by default of the scene.
+        """Return ``frames`` after a check, or the number of frames of the scene if it is None; one second by default.
 
         Raises:
             InputError: ``frames`` is not a whole number from 1 to 2³¹ − 1.
