@@ -8,6 +8,7 @@ from bench.arrangements import trace
 from bench.paper import crystal_balls
 from bench.paper.output import Output, table
 from warpmag.declarations.magnets import SATURATION_OF_IRON
+from warpmag.moments.dynamics import STEP
 
 METHODS = {"llg": ("clamped", "Kim et al. 2018"), "theta-euler": ("tanh", "the paper"), "theta": ("tanh", "warpmag")}
 """Curve and author of each dynamics."""
@@ -33,11 +34,12 @@ def run(output: Output):
     output.report(
         f"""## Fig. 7: crystal balls
 
-**Paper:** under the strong bar, Kim et al. 2018 give "oscillating and divergent submagnetizations" (b), the paper's
-dynamics "quickly converges" (c).
+**Paper:** under the strong bar the method of Kim et al. 2018 gives "oscillating and divergent submagnetizations" (the
+paper's panel b). The paper's dynamics "quickly converges" (panel c).
 
-**Here:** 178 balls around a bar, M1 red and M2 blue, after at most {ITERATIONS} iterations at one step for both
-strengths. Where the two coincide, the ball is saturated.
+**Here:** the figure shows 178 balls around a bar magnet, before induction (left) and after it. Induction ends at e_M ≤
+1e-3 or after {ITERATIONS} iterations; κ of pairs is {STEP:g} for both bars. M1 is red and M2 is blue. A ball is
+saturated where they coincide.
 
 {output.save(figure)}
 

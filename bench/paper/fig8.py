@@ -89,25 +89,26 @@ def _second_choices(output: Output) -> str:
 
     steps, starts = rows_of(explicit, "step", STEPS), rows_of(explicit, "start", crystal_balls.PAIRS)
     bars, layouts = rows_of_bars(), rows_of_bars(cells=crystal_balls.OTHER_CELLS)
-    columns, rows, length, width = crystal_balls.OTHER_CELLS
-    return f"""**Does the result depend on the constants that the paper leaves open?** Iterations, or (error after
-{MOST_ITERATIONS:,}).
+    grid, (columns, rows, length, width) = crystal_balls.CELLS, crystal_balls.OTHER_CELLS
+    return f"""**Does the result depend on the constants that the paper leaves open?** The tables below list the
+iterations to e_M ≤ {TOLERANCE:g}. A dash means not converged; e_M after {MOST_ITERATIONS:,} iterations follows.
 
-Other steps. With small steps damping-only LLG and even LLG converge under the strong bar, in hundreds and thousands of
-iterations. With large steps `theta-euler` does not converge there:
+Other steps:
 
 {table(["dynamics", "bar", *(f"κ = {step:g}" for step in STEPS)], steps)}
 
-Other strengths of the bar, κ = {STEP:g}:
+Other magnetizations of the bar, κ = {STEP:g}:
 
 {table(["dynamics", *(f"{bar:g} A/m" for bar in BARS)], bars)}
 
-Another arrangement, {columns} × {rows} cells and a bar of {length} × {width}, κ = {STEP:g}:
+A grid of {columns} × {rows} cells with a bar of {length} × {width} cells, κ = {STEP:g}. In the other tables the grid
+has {grid[0]} × {grid[1]} cells and the bar {grid[2]} × {grid[3]}:
 
 {table(["dynamics", *(f"{bar:g} A/m" for bar in BARS)], layouts)}
 
-Other starts of the pairs, κ = {STEP:g}. Where M1 = −M2 is along the field, every dynamics of pairs is slow: a
-submagnetization moves only perpendicular to itself, so M along the pair's axis grows from zero. `theta` has no pairs:
+Other initial directions of M1 = −M2, κ = {STEP:g}: perpendicular to the plane of the balls ("across"), in this plane
+and perpendicular to the bar, and random. Under the weak bar pairs along the field are slow, since a submagnetization
+moves only perpendicular to itself. So M along the axis of the pair changes in second order only. `theta` has no pairs:
 
 {table(["dynamics", "bar", *crystal_balls.PAIRS], starts)}"""
 
@@ -120,11 +121,11 @@ def _text(image, histories, second) -> str:
 dynamics "converges fast regardless of the magnetic field strengths"; (c) damping-only LLG does not converge under the
 strong bar and "a little faster" than (a) under the weak one.
 
-**Here:** one step κ = {STEP:g} for every explicit method and both strengths, pairs starting demagnetized, M1 = −M2,
-across the plane of the balls. `theta` is this library's method, accelerated; it has no step to choose.
+**Here:** κ is {STEP:g} for all dynamics of pairs and both bars. Pairs start demagnetized, M1 = −M2, perpendicular to
+the plane of the balls. `theta` has an automatic step.
 
 {image}
 
-{table(["dynamics", "bar", f"iterations to e_M ≤ {TOLERANCE:g}, or (error left after {ITERATIONS})"], rows)}
+{table(["dynamics", "bar", f"iterations to e_M ≤ {TOLERANCE:g}, or (e_M after {ITERATIONS})"], rows)}
 
 {second}"""

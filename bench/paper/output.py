@@ -12,8 +12,23 @@ ORDER = ("fig7", "fig8", "fig9", "fig10", "uniqueness", "stability", "table1")
 _MARK = "<!-- section {} -->"
 _HEAD = """# The paper's experiments, repeated
 
-Kim and Han 2022, "Fast Stabilization of Inducible Magnet Simulation". Each section states the paper's result, in its
-words or numbers (its images are not redistributed here), and the measured one. Written by `python -m bench.paper`.
+This page repeats the experiments of Kim and Han 2022, "Fast Stabilization of Inducible Magnet Simulation",
+[doi:10.1145/3550469.3555410](https://doi.org/10.1145/3550469.3555410). The paper compares its method with Kim, Park and
+Han 2018, "Magnetization Dynamics for Magnetic Object Interactions". Each section states the paper's result, in its
+words or numbers, and the result measured here. The paper's images are not redistributed. Numbers of figures, tables and
+equations are the paper's. `python -m bench.paper all` repeats all experiments and writes a report.
+
+| name | meaning |
+| --- | --- |
+| Ms, f(H), k | saturation magnetization; magnetization curve; initial slope of the curve, 3 for a ball |
+| M1, M2 | pair of submagnetizations of size Ms of each moment; its magnetization is M = (M1 + M2)/2 |
+| e_M | relative magnetization error, ‖M − f(H)‖/‖f(H)‖ (Eq. 12) |
+| κ | dimensionless step β Δt Ms of a pair |
+| `theta`, `warpmag` | this library: exact, accelerated flow of θ, tanh curve (Eq. 10), Kelvin's force (Eq. 13) |
+| `theta-euler`, `paper` | Kim and Han 2022: explicit steps of θ (Eqs. 8, 9), tanh curve, the force of Eq. 4 |
+| `llg`, `kim2018` | Kim et al. 2018: explicit steps of LLG (Eq. 6), clamped curve (Eq. 7), Kelvin's force |
+| `llg-damping` | LLG without precession, clamped curve |
+| weak, strong bar | magnetization 1e6 and 4e7 A/m; ‖H‖ at the balls is 0.8 to 20 % of Ms, and 0.3 to 8 Ms |
 """
 
 

@@ -55,28 +55,33 @@ def _trial(scene: str, seconds: float, device: str, method="warpmag", parameters
 
 def _text(results: str, seconds: float) -> str:
     balls, letters = (SATURATED[scene] for scene in ("balls_up", "alphabets"))
-    return f"""## Stability: the dynamic scenes for {seconds:g} s
+    return f"""## Stability of the dynamic scenes
 
-**Paper:** with kim2018 the balls of Balls Up do not settle, the letters of Alphabets are blown up, and the balls of
-Falling Magnet scatter. With the paper's method the balls settle, the letters stay together, and the balls cling (Figs.
-3 to 6).
+**Paper:** with Kim et al. 2018 the balls of Balls Up do not settle, the letters of Alphabets fly apart, and the balls
+of Falling Magnet scatter. With the paper's method the balls of Balls Up settle, the letters stay together, and the
+balls of Falling Magnet cling to the magnet (Figs. 3 to 6).
 
-**Here:** steps of 1 ms, split into substeps according to the speeds. Bodies are "held" if they touch a magnet, directly
-or through others. No body holds the letters, so all of them count. A run ends after {TIME_LIMIT:g} s of wall time.
+**Here:** steps are 1 ms long, split into substeps according to the speeds. A run simulates {seconds:g} s, one of
+kim2018 {SHORT * seconds:g} s; speeds after different times are not comparable. A run ends early after {TIME_LIMIT:g} s
+of wall time. The column "end" lists the simulated time.
 
-The force of Eq. 4 on a moment is λ times Kelvin's force, where λ falls from 8 in weak fields to 1 in saturation.
-Between two magnets of different λ, action and reaction differ, so momentum is not conserved. A free magnet and the
-balls on one side of it accelerate each other, and a heap of letters turns about a moment.
+* Method: "warpmag, Eq. 4" is this library's dynamics with the paper's force law. The name of a kim2018 row ends with κ
+  and the largest number of field evaluations of an induction. The paper states neither.
+* "Saturated" denotes scenes whose bodies have a lower Ms, so that magnets saturate the bodies near them:
+  {balls["saturation"]:g} A/m in place of 1.7e6 for balls, and {letters["saturation"]:g} A/m for letters, whose magnet
+  has {letters["moment"]:g} A·m² in place of 12. The paper states no strengths. It calls its magnets "excessively
+  strong", and argues in section 6.1 that f'(H) falls as M grows, as it does in bodies that saturate.
+* Induction is converged at e_M ≤ 1e-3. Several substeps may share one field evaluation.
+* A body is "held" if it touches a magnet, directly or through other bodies. Nothing collides with the magnet of
+  Alphabets, so its cells for held bodies are empty.
+* Balls Up has no friction, so a ball that hangs on another ball swings without decay, and a single ball can dominate
+  the RMS speed. The table also lists the median.
+* "Farthest" is the largest distance of a magnet from the mean initial position, at any time. "Deepest overlap" is
+  relative to the radius of a ball, or half of the smallest dimension of the thinner body.
 
-The paper states no strengths. Its "excessively strong" magnets, and its argument that f'(H) falls as M grows (section
-6.1), concern saturation. "Saturated" denotes the same scenes with magnets that saturate the bodies they hold: balls at
-{balls["saturation"]:g} A/m in place of 1.7e6, letters at {letters["saturation"]:g} A/m with a moment of
-{letters["moment"]:g} A·m² in place of 12.
-
-"kim2018" denotes pairs of submagnetizations with Eq. 7 and Kelvin's force, for {SHORT * seconds:g} s.
-The step κ of the pairs and the largest number of field evaluations of an induction follow. The paper states neither.
-
-Without friction a ball that hangs on another ball swings forever. So a single ball may dominate the RMS speed in Balls
-Up. The median describes the others.
+The force of Eq. 4 on an inducible moment is λ times Kelvin's force, and λ falls from 8 in weak fields to 1 in
+saturation (Fig. 10). Between two moments of different λ, action and reaction differ, so momentum is not conserved. A
+free magnet and the balls on one side of it accelerate together without an external force. A heap of letters starts to
+rotate.
 
 {results}"""

@@ -10,6 +10,7 @@ import itertools
 from bench.paper.output import Output, table
 from bench.paper.trials import SCENES, Trial, outcome_cells, run_trials
 from warpmag.declarations.magnets import PRESETS
+from warpmag.moments.dynamics import STEP
 
 SECONDS, SMALL_SECONDS = 1.0, 0.05
 RTOL = 1e-2
@@ -41,22 +42,25 @@ def run(output: Output):
         row = {"scene": trial.scene, "method": trial.method, "steps": values["steps"]}
         row |= {f"T{part} [ms]": f"{values[f't{part}_ms']:.3g}" for part in "ifr"}
         papers = PAPERS_TIMES.get((trial.scene, trial.method), ())
-        row["paper's Ti / Tf / Tr"] = " / ".join(f"{number:.3g}" for number in papers)
+        row["paper's Ti / Tf / Tr [ms]"] = " / ".join(f"{number:.3g}" for number in papers)
         rows.append(row | outcome_cells(values))
     output.report(_text(table(list(rows[0]), [list(row.values()) for row in rows]), kind), part=kind)
 
 
 def _text(results: str, kind: str) -> str:
+    cores = " Each run has two cores." if kind == "cpu" else ""
     return f"""## Table 1 on a {kind.upper()}: time per step
 
 **Paper:** milliseconds per 1 ms step on an Intel i7-8700, 1,000 steps; its rigid bodies are Bullet's.
 
-**Here:** rigid bodies are Newton's XPBD, and all three methods differ only in dynamics, curve and force law. On a CPU
-each run has two cores. Times are means over the steps done; a case ends after
-{round(1000 * SECONDS):,} steps or {TIME_LIMIT[kind]:g} s, and its last columns describe the scene at that time.
+**Here:** Newton's XPBD solves the rigid bodies. The methods differ only in dynamics, curve and force law (table at the
+top); κ of pairs is {STEP:g}.{cores} Ti, Tf and Tr are mean times of induction, magnetic forces and rigid bodies per
+step of 1 ms, with all its substeps. A case ends after {round(1000 * SECONDS):,} steps or {TIME_LIMIT[kind]:g} s of wall
+time; the last columns describe the scene at that time. Where "steps" is below {round(1000 * SECONDS):,}, the means
+cover the start of the scene only, and are not comparable with other rows.
 
-Induction ends at an error of {RTOL:g} or after 1,000 evaluations. The paper does not state at which error a
-magnetization is converged; "until every M converges" may mean that M stopped moving, which slow pairs do long before
-their error is small. In weak fields, before a magnet has come near, pairs do not reach the relative error at all.
+Induction ends at e_M ≤ {RTOL:g} or after 1,000 evaluations. The paper does not state the error at which a magnetization
+is converged. "Until every M converges" may mean until M hardly changes, and slow pairs hardly change long before the
+error is small. In weak fields, before a magnet comes near, pairs do not reach this relative error in 1,000 evaluations.
 
 {results}"""
