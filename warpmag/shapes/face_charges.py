@@ -1,7 +1,7 @@
 """Charges on a flat face of iron that vary over less than a cell, and their response to a potential.
 
 Cells are uniformly magnetized, and so are the charges of their faces. In front of the edge of a magnet the charge of an
-iron face varies over less than a cell. Without that a magnet in contact pulls 15 to 30 % too little.
+iron face varies over less than a cell. Without that a magnet in contact pulls too little.
 
 A face gets charges q on equal squares besides. Those of an ideally permeable body keep its surface at one potential:
 S q + φ = const with the potentials S of uniformly charged squares. The magnetization of the cells has uniform charges,
