@@ -50,7 +50,7 @@ class Magnets:
         magnets.set_current("coil", actions)
         observations = magnets.readings("hall")
 
-    Prims that are magnets by ``warpmag:`` attributes are magnets in all environments, without a declaration.
+    Prims with the schema ``WarpmagMagnetAPI`` are magnets in all environments, without a declaration.
     """
 
     _of_simulation: ClassVar[WeakKeyDictionary] = WeakKeyDictionary()
@@ -77,8 +77,8 @@ class Magnets:
         """Make bodies or shapes inducible magnets, in all environments.
 
         Args:
-            declaration: Arguments of :func:`warpmag.add_inducible`. ``body`` and ``shape`` are patterns of prim paths,
-                such as ``"*/Ball_*"``. They are checked when the physics starts.
+            declaration: Arguments of :func:`warpmag.add_inducible`. ``body`` and ``shape`` are shell patterns of prim
+                paths, such as ``"*/Ball_*"``. They are checked when the physics starts.
         """
         self._declarations.append(partial(add_inducible, **declaration))
 
