@@ -136,6 +136,33 @@ def test_fields_of_halves_are_means_over_the_halves(device):
     assert error < 0.03
 
 
+def test_searches_of_earlier_poses_leave_no_trace(device):
+    """Fields and forces after a search are the same before and after others: entries of old rows do not act.
+
+    A cell of a pair writes into the row of the other one, and rows of a vector have different lengths.
+    """
+    bodies, turn = [FINE, SHEET, SHEET], Rotation.from_rotvec([0.1, 0.05, 0.3])
+    system, _ = make_pair(bodies, [(turn, place) for place in np.zeros((3, 3))], device=device)
+    rng, count = np.random.default_rng(4), system.count
+    moments = wp.array(rng.normal(size=(count, 3)) * 1e-3 * FAINT, dtype=system.moments.dtype, device=device)
+
+    def values(shift):
+        places = [(0.0, 0.0, 0.0), (0.002 + shift, 0.001, 0.0117), (0.003, 0.002 - shift, 0.0132)]
+        put(system, bodies, [(turn, np.array(place)) for place in places])
+        system.start_from(moments)
+        system.begin()
+        system.evaluate()
+        system.apply_forces()
+        return np.concatenate([system.h.numpy(), system.forces.numpy(), system.torques.numpy()], axis=1)
+
+    first = values(0.0)
+    for shift in (0.004, -0.005, 0.011, 0.003):
+        values(shift)
+        again = values(0.0)
+        largest = np.abs(first).max(axis=0)
+        assert np.all(np.abs(again - first) <= 1e-12 * largest)  # sums in another order
+
+
 def test_shares_of_boxes_in_each_other():
     """Boxes at random poses, compared with points that are inside: exact for parallel edges, 0 for disjoint boxes."""
     rng, disjoint, inside = np.random.default_rng(3), 0, 0

@@ -74,6 +74,16 @@ CUDA_CALLABLE inline Number face_angles(const BoxView& v, const Number* x, const
     return sum;
 }
 
+// Column of K along an axis.
+CUDA_CALLABLE inline Vector box_column(const BoxView& v, int axis) {
+    auto log_x = [&] { return -INVERSE_4_PI * edge_logarithms(v, v.half.x, 1, 2, 4); };
+    auto log_y = [&] { return -INVERSE_4_PI * edge_logarithms(v, v.half.y, 2, 1, 4); };
+    auto log_z = [&] { return -INVERSE_4_PI * edge_logarithms(v, v.half.z, 4, 1, 2); };
+    if (axis == 0) return {INVERSE_4_PI * face_angles(v, v.x, v.y, v.z, 1, 2, 4), log_z(), log_y()};
+    if (axis == 1) return {log_z(), INVERSE_4_PI * face_angles(v, v.y, v.z, v.x, 2, 4, 1), log_x()};
+    return {log_y(), log_x(), INVERSE_4_PI * face_angles(v, v.z, v.x, v.y, 4, 1, 2)};
+}
+
 // K of the box.
 CUDA_CALLABLE inline Symmetric box_tensor(const BoxView& v) {
     const Number zero = v.half.x * Real(0);

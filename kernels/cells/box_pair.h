@@ -52,7 +52,7 @@ CUDA_CALLABLE inline Window window_between(Number d, Real begin, Real end, Mask 
 // A pair of boxes in units of ``1/unit``: half sides, separation r from i to j, rotation of j in the frame of i, radii
 // of the balls, the window of all boxes, that of close boxes, and that of 4 × 4 × 2 points. ``own_points``: the Gauss
 // points are those of i. ``of_ball``: the other one of the pair, the source, is a ball; ``at_ball``: the one with the
-// points is. ``linear``: one of the two has differences.
+// points is. ``linear``: one of the two has differences, and they act.
 struct BoxPair {
     Vector half, other_half, r;
     Rotation<Number> rotation;
@@ -62,7 +62,7 @@ struct BoxPair {
 };
 CUDA_CALLABLE inline Number longest(Vector half) { return larger(half.x, larger(half.y, half.z)); }
 CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, const RelativePose& pose, Mask listed,
-                                      Mask own_first) {
+                                      Mask own_first, Mask differ) {
     const Number unit = 2 / (own.size + other.size);
     const Vector r = unit * pose.r;
     const Number d = length(r);
@@ -83,7 +83,7 @@ CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, cons
             own_points,
             own_points ? other.ball : own.ball,
             own_points ? own.ball : other.ball,
-            own.linear | other.linear};
+            (own.linear | other.linear) & differ};
 }
 
 // Upper half of a box along an axis, seen from a point of the frame of the box.
@@ -167,14 +167,15 @@ struct SourceAndTarget {
         const Number volume = 8 * half.x * half.y * half.z;
         scale = Real(1.0 / 8) / (is_ball ? zero + 1 : volume);
     }
-    // Field tensor of the source, times its volume if it is a box, and of the upper half of a box along an axis.
+    // Field tensor of the source, times its volume if it is a box, and its column along an axis for the upper half of a
+    // box along it.
     CUDA_CALLABLE Symmetric tensor(Vector at) const {
         const Symmetric box = box_tensor(view_box(at, half));
         return any(is_ball) ? choose(is_ball, ball_tensor(at, radius), box) : box;
     }
-    CUDA_CALLABLE Symmetric upper_half_tensor(Vector at, int axis) const {
-        const Symmetric box = box_tensor(view_upper_half(at, half, axis));
-        return any(is_ball) ? choose(is_ball, Real(0.5) * ball_tensor(at, radius), box) : box;
+    CUDA_CALLABLE Vector upper_half_column(Vector at, int axis) const {
+        const Vector box = box_column(view_upper_half(at, half, axis), axis);
+        return any(is_ball) ? choose(is_ball, Real(0.5) * column(ball_tensor(at, radius), axis), box) : box;
     }
     // Force of the source on a moment ``here``.
     CUDA_CALLABLE Vector push(Vector at, Vector moment, Vector here) const {
@@ -216,7 +217,7 @@ CUDA_CALLABLE inline PairMatrices boxes_matrices(const BoxPair& p, Points points
         const Symmetric full = point.weight * s.tensor(at);
         total = total + full;
         for (int l = 0; l < 3 && linear; ++l) {
-            const Vector of_both = column(full, l), of_upper = point.weight * column(s.upper_half_tensor(at, l), l);
+            const Vector of_both = column(full, l), of_upper = point.weight * s.upper_half_column(at, l);
             const Vector mean = to_body(s.rotation, of_both), difference = to_body(s.rotation, 2 * of_upper - of_both);
             const Number by_mean[3] = {mean.x, mean.y, mean.z},
                          by_difference[3] = {difference.x, difference.y, difference.z};
@@ -348,10 +349,12 @@ CUDA_CALLABLE inline Wrench boxes_wrench(const BoxPair& p, const PairMoments& mo
     const Mask own = p.own_points;
     const Vector m_s = s.to_source(p, moments.m), e_s = s.to_source(p, moments.e);
     const Vector of_target = s.choose(own, m_s, e_s), of_source = s.choose(own, e_s, m_s);
-    const Vector at_target = s.choose(own, moments.own_difference, moments.other_difference);
-    const Vector at_source = s.choose(own, moments.other_difference, moments.own_difference);
-    Vector force = {zero, zero, zero}, torque = force; // on the target, about the center of the source
-    Number work = zero, change = zero;                 // and the change of the work with the window of fine points
+    const Vector none = {zero, zero, zero};
+    auto acting = [&](Vector difference) { return s.choose(p.linear, difference, none); };
+    const Vector at_target = acting(s.choose(own, moments.own_difference, moments.other_difference));
+    const Vector at_source = acting(s.choose(own, moments.other_difference, moments.own_difference));
+    Vector force = none, torque = none; // on the target, about the center of the source
+    Number work = zero, change = zero;  // and the change of the work with the window of fine points
     for_gauss_points(s.target_half, p.fine.value, points, [&](const GaussPoint& point) {
         const Vector at = s.center + to_world(s.rotation, point.at), signs = point.signs;
         const Vector difference = {signs.x * at_target.x, signs.y * at_target.y, signs.z * at_target.z};
@@ -363,16 +366,17 @@ CUDA_CALLABLE inline Wrench boxes_wrench(const BoxPair& p, const PairMoments& mo
             work += point.weight * of_point;
             change += point.slope * of_point;
         };
-        auto add_half = [&](int axis, Vector source) {
+        auto add_half = [&](int axis, Number source) {
             const BoxView view = view_upper_half(at, s.half, axis);
-            add(box_slope(view, source, here), box_tensor(view) * source);
+            const Vector along = {axis == 0 ? source : zero, axis == 1 ? source : zero, axis == 2 ? source : zero};
+            add(box_slope(view, along, here), source * box_column(view, axis));
         };
         const Vector mean = of_source - at_source;
         add(s.push(at, mean, here), s.tensor(at) * mean);
         if (!any(p.linear)) return;
-        add_half(0, {2 * at_source.x, zero, zero});
-        add_half(1, {zero, 2 * at_source.y, zero});
-        add_half(2, {zero, zero, 2 * at_source.z});
+        add_half(0, 2 * at_source.x);
+        add_half(1, 2 * at_source.y);
+        add_half(2, 2 * at_source.z);
     });
     const Vector about_target = torque - cross(s.center, force);
     const Vector inward = -1 / larger(length(p.r), zero + Real(1e-12)) * p.r;

@@ -64,12 +64,14 @@ CUDA_CALLABLE inline Boxes turned(Boxes box, Vector v) {
 // A vector of pairs, of which some are ``listed``: boxes, and whether cell i precedes its candidate.
 struct CellPair {
     Boxes box, other;
-    Mask listed, first;
+    Mask listed, first, differ; // ``differ``: differences act
 
-    CUDA_CALLABLE BoxPair in_units() const { return box_pair(box, other, relative_pose(box, other), listed, first); }
+    CUDA_CALLABLE BoxPair in_units() const {
+        return box_pair(box, other, relative_pose(box, other), listed, first, differ);
+    }
     // The pair after a small motion, in which box j moves by ``shift`` relative to box i.
     CUDA_CALLABLE CellPair moved(Vector shift, Vector turn, Vector other_turn) const {
-        CellPair pair = {turned(box, turn), turned(other, other_turn), listed, first};
+        CellPair pair = {turned(box, turn), turned(other, other_turn), listed, first, differ};
         pair.other.center += shift;
         return pair;
     }
@@ -125,7 +127,8 @@ template <class Gradients> CUDA_CALLABLE inline void differentiate_row(const Gra
     CellSums sums = {none, none, none, none};
     for (int slot = share(); slot < rows.slots; slot += SHARES) {
         const Cells other = rows.candidates(slot);
-        const CellPair pair = {box, rows.boxes(other), rows.listed(other), precedes(rows.own, other)};
+        const CellPair pair = {box, rows.boxes(other), rows.listed(other), precedes(rows.own, other),
+                               rows.differ(slot)};
         const CellMoments other_m = moments_of(g.moments, other);
         if (pass == OF_FIELD) add_field_gradient(pair, m, eta, other_m, moments_of(g.cotangents, other), sums);
         else

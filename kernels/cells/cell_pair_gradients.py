@@ -19,7 +19,7 @@ _OF_FIELD, _OF_WRENCH = range(2)
 """The passes; as in ``cell_pair_gradients.h``."""
 _STEP = 3e-6
 """Largest motion of a pair in a difference, in mean sizes and radians: about the cube root of the precision."""
-_SHARED_ARRAYS = "candidate", "candidate_count", "rows", "cell", "column"
+_SHARED_ARRAYS = "candidate", "candidate_count", "rows", "cell", "column", "kind_end"
 """Arrays of whole numbers that are those of the pairs."""
 
 

@@ -3,7 +3,8 @@
 The sums over pairs treat a cell as a ball, which is wrong for neighbors: a flat cell's ball reaches through a sheet. So
 cells that are near each other act on each other as boxes, at the present poses of their bodies (``cell_pairs.h``). The
 candidates are found by the neighbor search of ``pairs.neighbors``. The tensor of a pair is kept while the relative pose
-of its bodies rests. Balls act on cells by the average of their field and its difference between the halves of a cell.
+of its bodies rests. The row of one cell of a close pair computes for both. Balls act on cells by the average of their
+field and its difference between the halves of a cell.
 
 The operator of induction is positive for disjoint bodies: it is the exact one, integrated by Gauss points. For bodies
 that intersect the points can make it negative. So a cell inside another body gets an additional demagnetizing factor.
@@ -60,14 +61,14 @@ _SAMPLES = 32
 """Points whose neighbors are counted for the length of the lists."""
 _MARGIN = 0.5
 """Part of half its size that a cell may move before candidates are searched again."""
-LOCATE, CLEAR, SELECT, ARRANGE, ASSIGN, TABULATE, TAKE_BALLS, ADD_FIELD, ADD_FORCE = range(9)
+LOCATE, CLEAR, SELECT, ARRANGE, ASSIGN, LINK, TABULATE, TAKE_BALLS, ADD_FIELD, ADD_FORCE, ADD_REACTION = range(11)
 """The passes, in order; as in ``cell_pairs.h``."""
-_MATRIX_ROWS, _DETAIL_ROWS, _POSE_ROWS = 9, 27, 7
-"""Numbers of the matrices of a pair and of a relative pose; as in ``cell_pairs.h``."""
-_KINDS = 6
-"""Kinds of candidates; as in ``cell_pairs.h``."""
+_MATRIX_ROWS, _DETAIL_ROWS, _POSE_ROWS, _REACTION_ROWS = 9, 27, 7, 8
+"""Numbers of the matrices of a pair, of a relative pose, and of a force and torque; as in ``cell_rows.h``."""
+_KINDS = 10
+"""Kinds of candidates; as in ``cell_rows.h``."""
 _BINS = 256
-"""Bins of rows by their numbers of candidates; as in ``cell_pairs.h``."""
+"""Bins of rows by their numbers of candidates; as in ``cell_rows.h``."""
 CELLS_PER_THREAD = 100
 """Fewest cells per thread of a CPU."""
 
@@ -111,14 +112,17 @@ def cell_pairs_type(dtype):
         rows: wp.array[int]  # number of rows, shape [1]
         bin: wp.array[int]  # bin of each moment by its numbers of candidates, −1 for no row, shape [n]
         bin_end: wp.array[int]  # end of each bin's rows, shape [BINS]
-        kinds: wp.array[int]  # numbers of each kind of candidates, shape [n, KINDS], flat
+        kind_end: wp.array[int]  # end of each kind of candidates in the row of a moment, shape [n, KINDS], flat
         cell: wp.array[int]  # cell of each row, shape [c padded]
+        row_of: wp.array[int]  # row of each moment that has one, shape [n]
         column: wp.array[int]  # candidates of each row, shape [c padded / CHUNK, capacity, CHUNK], flat
+        other_slot: wp.array[int]  # slot of each owned pair in its other cell's row, or who owns it, like ``column``
         near_end: wp.array[int]  # end of the slots in the window, of vectors of rows, shape [c padded]
         pose: wp.array[dtype]  # relative pose of each tensor, shape [c padded / CHUNK, capacity, 7, CHUNK], flat
         overlap_factor: wp.array[dtype]  # demagnetizing factor of overlaps over the volume [1/m³], shape [c padded]
         matrix: wp.array[dtype]  # T_ij of means [1/m³], shape [c padded / CHUNK, capacity, 9, CHUNK], flat
         detail: wp.array[dtype]  # of, at and between differences [1/m³], [c padded / CHUNK, close_capacity, 27, CHUNK]
+        reaction: wp.array[dtype]  # force and torque/μ0 by the row of the other cell, shape [c padded, capacity, 8]
 
     return CellPairs
 
@@ -267,19 +271,20 @@ class CellPairs:
         a.means, a.differences, a.difference_field = cells.means, cells.differences, cells.difference_field
         a.candidate, a.candidate_count, a.found_at = lists.neighbor, lists.count, lists.found_at
         a.moved, a.searching, a.box = lists.moved, lists.searching, zeros(LINE * n, kind=dtype)
-        self.crowded, a.kinds = zeros(1), zeros(_KINDS * n)
+        self.crowded, a.kind_end = zeros(1), zeros(_KINDS * n)
         a.crowded = self.crowded
-        a.rows, a.bin, a.bin_end = zeros(1), zeros(n), zeros(_BINS)
+        a.rows, a.bin, a.bin_end, a.row_of = zeros(1), zeros(n), zeros(_BINS), zeros(n)
         a.cell, a.near_end, a.overlap_factor = zeros(padded), zeros(padded), zeros(padded, kind=dtype)
         a.pose = _large_zeros(padded * capacity * _POSE_ROWS, dtype, device)
-        a.column = _large_zeros(padded * capacity, wp.int32, device)
+        a.column, a.other_slot = (_large_zeros(padded * capacity, wp.int32, device) for _ in range(2))
         a.close_capacity = min(capacity, _LONGEST_CLOSE) if a.linear.numpy().any() else 0
         a.matrix = _large_zeros(padded * capacity * _MATRIX_ROWS, dtype, device)
         a.detail = _large_zeros(padded * a.close_capacity * _DETAIL_ROWS, dtype, device)
+        a.reaction = _large_zeros(padded * capacity * _REACTION_ROWS, dtype, device)
         self._locate, self._tabulate = self._record(LOCATE, LOCATE), self._record(CLEAR, TABULATE)
         self._field, self._force = (
             self._record(TAKE_BALLS if len(taken) else ADD_FIELD, ADD_FIELD),
-            [*(self._record(TAKE_BALLS, TAKE_BALLS) if len(taken) else []), *self._record(ADD_FORCE, ADD_FORCE)],
+            [*(self._record(TAKE_BALLS, TAKE_BALLS) if len(taken) else []), *self._record(ADD_FORCE, ADD_REACTION)],
         )
 
     def for_all_moments(self, cells, packed, h) -> "CellPairs":
@@ -327,5 +332,8 @@ class CellPairs:
 
     def persistent_arrays(self) -> dict[str, wp.array]:
         """Return the arrays that the next search and the next evaluation read, by name."""
-        kept = ("rows", "cell", "column", "pose", "matrix", "detail", "overlap_factor", "crowded", "kinds")
+        kept = (
+            "rows", "cell", "row_of", "column", "other_slot", "pose", "matrix", "detail", "overlap_factor",
+            "crowded", "kind_end",
+        )  # fmt: skip
         return neighbors.persistent_lists(self._lists) | {name: getattr(self.arrays, name) for name in kept}

@@ -35,6 +35,9 @@ CUDA_CALLABLE inline Mask mask_of(bool condition) { return condition; }
 CUDA_CALLABLE inline Number numbers(const Real* row) { return *row; }
 CUDA_CALLABLE inline Index indices(const int* row) { return *row; }
 CUDA_CALLABLE inline void put(Real* row, Number n) { *row = n; }
+CUDA_CALLABLE inline void put_where(Mask active, Real* row, Number n) {
+    if (active) *row = n;
+}
 CUDA_CALLABLE inline void put_indices(int* row, Index n) { *row = n; }
 CUDA_CALLABLE inline Number gather(const Real* row, const int* j) { return row[*j]; }
 CUDA_CALLABLE inline Number collect(const Real* row, Index j) { return row[j]; }
@@ -110,6 +113,16 @@ inline Index indices(const int* row) {
     return n;
 }
 inline void put(Real* row, Number n) { __builtin_memcpy(row, &n, sizeof(n)); }
+// Stores the numbers of active lanes. Other threads may write the other ones at the same time.
+template <class Lanes> inline void put_where(Mask active, Real* row, Lanes n) {
+#if defined(__AVX512DQ__)
+    if constexpr (WIDTH == 16) __builtin_ia32_storeups512_mask(row, n, __builtin_ia32_cvtd2mask512(active));
+    else __builtin_ia32_storeupd512_mask(row, n, __builtin_ia32_cvtq2mask512(active));
+#else
+    for (int l = 0; l < WIDTH; ++l)
+        if (active[l]) row[l] = n[l];
+#endif
+}
 inline void put_indices(int* row, Index n) { __builtin_memcpy(row, &n, sizeof(n)); }
 inline Number gather(const Real* row, const int* j) {
     Number n = 0;
