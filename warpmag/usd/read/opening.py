@@ -24,7 +24,7 @@ from warpmag.usd.read.input_errors import NOT_USD, one_line_of, usd_errors
 from warpmag.usd.read.instancers import complete_instances, expand_instancers
 from warpmag.usd.read.keys import make_kinematic
 from warpmag.usd.read.prims import descendants
-from warpmag.usd.read.trial_read import MOST_NAMES, irregular_dependency, irregular_file, trial_read
+from warpmag.usd.read.trial_read import MOST_NAMES, irregular_file, trial_read
 from warpmag.usd.read.units import convert_units
 from warpmag.usd.values import check_type, declared, quiet
 
@@ -59,10 +59,7 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
 
 def open_deferred(path: str | os.PathLike, time_code: float | None = None) -> tuple[Usd.Stage, list[IdenticalBalls]]:
     """Open a stage like :func:`open_stage`; return it with the identical balls whose prims are not created yet."""
-    file = _readable(path)
-    if reason := trial_read(full_path(file)):
-        raise InputError(f"{path}: {reason}")
-    stage = _open(file, path)
+    stage = _open(path)
     with usd_errors(str(path)):
         time_code = start_of(stage) if time_code is None else time_code
         deferred = expand_instancers(stage, time_code, defer=True)
@@ -72,15 +69,8 @@ def open_deferred(path: str | os.PathLike, time_code: float | None = None) -> tu
 
 
 def open_animated(path: str | os.PathLike) -> tuple[Usd.Stage, list[BallInstancer]]:
-    """Open a stage with its time samples, in its own units; return it with the instancers whose balls have no prims.
-
-    There is no trial read in a child process: for a long run it would take longer than the export.
-    """
-    file = _readable(path)
-    with usd_errors(str(path), NOT_USD):
-        if reason := irregular_dependency(full_path(file)):
-            raise InputError(f"{path}: {reason}")
-    stage = _open(file, path)
+    """Open a stage with its time samples, in its own units; return it with the instancers whose balls have no prims."""
+    stage = _open(path)
     with usd_errors(str(path)):
         deferred = expand_instancers(stage, start_of(stage), defer=True)
         complete_instances([balls for balls in deferred if not balls.stays_instancer])
@@ -99,10 +89,13 @@ def _readable(path: str | os.PathLike) -> Path:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
 
 
-def _open(file: Path, path: str | os.PathLike) -> Usd.Stage:
-    """Open an existing file, with the name ``path`` in messages."""
+def _open(path: str | os.PathLike) -> Usd.Stage:
+    """Open a user's stage, after a trial read in a child process. All functions that read a stage open it here."""
+    file = full_path(_readable(path))
+    if reason := trial_read(file):
+        raise InputError(f"{path}: {reason}")
     with usd_errors(str(path), NOT_USD):
-        stage = Usd.Stage.Open(str(full_path(file)))
+        stage = Usd.Stage.Open(str(file))
         for layer in stage.GetUsedLayers():
             if layer.realPath and not layer.dirty:  # its file may have changed since it was read
                 layer.Reload()
@@ -223,7 +216,7 @@ def perspective_cameras(stage: Usd.Stage) -> list[Usd.Prim]:
 
 
 def describe(path: str | os.PathLike) -> str:
-    """Return the first line of a stage's documentation, without composing the stage."""
+    """Return the first line of the documentation of a trusted stage, such as a bundled one, without composing it."""
     layer = Sdf.Layer.OpenAsAnonymous(str(path), metadataOnly=True)
     return (layer.documentation.strip().splitlines() or [""])[0]
 

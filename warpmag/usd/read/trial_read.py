@@ -2,9 +2,10 @@
 
 It also decides which files a stage may name: regular files only. A pipe or a device would make the reader wait forever.
 
-The child costs a quarter of a second, so a single text file without references is read directly. This file is also the
-program of the child, which imports nothing of warpmag. Errors that USD raises are raised again when this process
-reads the stage.
+The child costs a quarter of a second, and for long recordings a fraction of the time of an export. A single text file
+without references is therefore read directly, and a stage is not tried again until one of its files changes. This file
+is also the program of the child, which imports nothing of warpmag. Errors that USD raises are raised again when this
+process reads the stage.
 """
 
 import contextlib
@@ -16,6 +17,7 @@ import signal
 import stat
 import subprocess
 import sys
+from collections.abc import Iterable
 from itertools import accumulate, islice
 
 MOST_PRIMS, DEEPEST_NESTING = 500_000, 5_000
@@ -32,19 +34,49 @@ _NO_BRACKETS = bytes(set(range(256)) - set(b"{[(}])"))
 _NO_TABLE, _NO_TEXT = "its table of contents names bytes beyond its end", "text that is not UTF-8"
 _WARNINGS = {b"posix_madvise": f"damaged: {_NO_TABLE}", b"UnicodeDecodeError": f"damaged: {_NO_TEXT}"}
 """Texts that USD prints on stderr in place of an error, and their meaning."""
+_readable_stages: dict[str, dict[str, tuple | None]] = {}
+"""Stages that can be read, with the files that each names and their stamps."""
 
 
 def trial_read(path: str | os.PathLike) -> str:
     """Return the reason not to read a file in this process, empty if it can be read."""
     if reason := irregular_file(path):
         return reason
+    stamps = _readable_stages.get(str(path))
+    if stamps and stamps == _stamps(stamps):
+        return ""
+    reason, *files = _trial(path)
+    if files and not reason:
+        mark_readable(path, files)
+    return reason
+
+
+def mark_readable(path: str | os.PathLike, files: Iterable[str | os.PathLike]) -> None:
+    """Spare a stage the trial read until one of its files changes."""
+    _readable_stages[str(path)] = _stamps({str(path), *map(str, files)})
+
+
+def _stamps(files: Iterable[str]) -> dict[str, tuple | None]:
+    """Return values that change with the files, None for a missing file."""
+    stamps: dict[str, tuple | None] = {}
+    for file in files:
+        try:
+            status = os.stat(file)
+            stamps[file] = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+        except (OSError, ValueError):
+            stamps[file] = None
+    return stamps
+
+
+def _trial(path: str | os.PathLike) -> list[str]:
+    """Return the reason not to read a file, empty if it can be read, and the files that the child found in it."""
     with open(path, "rb") as file:
         text = file.read() if file.peek(5).startswith(b"#usda") else b""
     nesting = accumulate(1 if bracket in b"{[(" else -1 for bracket in text.translate(None, _NO_BRACKETS))
     if max(nesting, default=0) > DEEPEST_NESTING:
-        return f"brackets are nested more than {DEEPEST_NESTING} deep"
+        return [f"brackets are nested more than {DEEPEST_NESTING} deep"]
     if text and not _ARCS.search(text) and text.count(b"API:") <= MOST_NAMES:
-        return ""
+        return [""]
     names = {os.path.join(os.path.dirname(path), os.fsdecode(name)) for name in re.findall(rb"@([^@\n\0]+)@", text)}
     size = os.path.getsize(path) + sum(os.path.getsize(name) for name in names if os.path.isfile(name))
     limit = round(_SECONDS + size / _BYTES_PER_SECOND)
@@ -56,11 +88,12 @@ def trial_read(path: str | os.PathLike) -> str:
             child = subprocess.run(command, check=False, **options)
             if child.returncode >= 0:
                 meanings = (meaning for words, meaning in _WARNINGS.items() if words in child.stderr)
-                return child.stdout.decode().strip() or next(meanings, "")
+                reason, *files = json.loads((child.stdout.splitlines() or [b'[""]'])[-1])
+                return [reason or next(meanings, ""), *files]
             if child.returncode != -signal.SIGXCPU:
-                return f"USD's reader crashes on it ({signal.Signals(-child.returncode).name})"
-        return f"USD did not read it within {limit} s"
-    return ""
+                return [f"USD's reader crashes on it ({signal.Signals(-child.returncode).name})"]
+        return [f"USD did not read it within {limit} s"]
+    return [""]
 
 
 def irregular_file(path: str | os.PathLike) -> str:
@@ -95,15 +128,20 @@ def _excess(layer) -> str:
     return ""
 
 
-def irregular_dependency(path: str | os.PathLike) -> str:
-    """Return :func:`irregular_file` of the first file that a stage names in any layer, variant, clip or attribute."""
-    from pxr import Ar, Sdf, UsdUtils  # noqa: PLC0415 - a parent of a child does without it
+def _irregular_dependency(path: str, seen: set[str]) -> str:  # pragma: no cover - runs in the child
+    """Return :func:`irregular_file` of the first file that a stage names in any layer, variant, clip or attribute.
 
-    pending, seen = [str(path)], {str(path)}
+    Add the names of all files to ``seen``.
+    """
+    from pxr import Ar, Sdf, UsdUtils  # noqa: PLC0415 - only the child needs it
+
+    pending = [path]
     while pending:
-        if reason := irregular_file(Ar.SplitPackageRelativePathOuter(pending[-1])[0]):
-            return reason
         name = pending.pop()
+        file = Ar.SplitPackageRelativePathOuter(name)[0]
+        seen |= {name, file}
+        if reason := irregular_file(file):
+            return reason
         layer = Sdf.Layer.FindOrOpen(name) if Sdf.FileFormat.FindByExtension(name) else None
         if layer is None:
             continue
@@ -118,13 +156,17 @@ def irregular_dependency(path: str | os.PathLike) -> str:
     return ""
 
 
-def _read(path: str, most_prims: int) -> str:  # pragma: no cover - runs in the child
-    """Read a stage up to the last value of its layers; return the reason to reject it, or an empty text."""
-    from pxr import Sdf, Usd  # noqa: PLC0415 - only the child needs it
+def _read(path: str, most_prims: int, files: set[str]) -> str:  # pragma: no cover - runs in the child
+    """Read a stage up to the last value of its layers; return the reason to reject it, or an empty text.
 
-    if reason := irregular_dependency(path):
+    Add the names of its files to ``files``.
+    """
+    from pxr import Sdf, Usd, UsdUtils  # noqa: PLC0415 - only the child needs it
+
+    if reason := _irregular_dependency(path, files):
         return reason
     stage = Usd.Stage.Open(path)
+    files |= {layer.realPath for layer in stage.GetUsedLayers() if layer.realPath}
     rates_are_valid = all(1e-6 < layer.timeCodesPerSecond < 1e9 for layer in stage.GetUsedLayers())
     prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies(Usd.PrimAllPrimsPredicate))
     for count, prim in enumerate(islice(prims, most_prims + 1), 1):
@@ -135,7 +177,9 @@ def _read(path: str, most_prims: int) -> str:  # pragma: no cover - runs in the 
             attribute.GetTimeSamples()  # never ends where offsets of layers overflow
     for layer in (layer for layer in stage.GetUsedLayers() if layer.GetFileFormat().formatId != "usda"):
         Sdf.Layer.CreateAnonymous(".usda").TransferContent(layer)
-    return ""
+    _, assets, _ = UsdUtils.ComputeAllDependencies(path)  # also evaluates expressions
+    files |= set(assets)
+    return next(filter(None, map(irregular_file, assets)), "")
 
 
 if __name__ == "__main__":  # pragma: no cover - runs in the child
@@ -145,8 +189,10 @@ if __name__ == "__main__":  # pragma: no cover - runs in the child
     limits = {resource.RLIMIT_AS: half, resource.RLIMIT_CORE: 0, resource.RLIMIT_CPU: int(sys.argv[4])}
     for kind, (soft, hard) in {kind: resource.getrlimit(kind) for kind in limits}.items():
         resource.setrlimit(kind, (limits[kind] if soft < 0 else min(soft, limits[kind]), hard))
+    files: set[str] = set()
     try:
-        print(_read(sys.argv[2], int(sys.argv[3])))
+        answer = [_read(sys.argv[2], int(sys.argv[3]), files), *sorted(files)]
     except Exception as error:  # the parent raises errors of other kinds again when it reads the stage
-        if isinstance(error, MemoryError) or "bad_alloc" in str(error):
-            print("USD needs more than half of the memory to read it")
+        needs_memory = isinstance(error, MemoryError) or "bad_alloc" in str(error)
+        answer = ["USD needs more than half of the memory to read it" if needs_memory else ""]
+    print(json.dumps(answer))

@@ -59,6 +59,11 @@ class Output:
         """Return the file of the same stem with another ending."""
         return self.root.with_name(f"{self.root.stem}{ending}")
 
+    def files(self) -> list[Path]:
+        """Return the files that the root layer may refer to, with the root layer, and without a scene elsewhere."""
+        copies = [self.beside(f".scene{end}") for end in _SCENES]
+        return [self.root, self.cache, self.instances, *copies, *self.beside(".scene").rglob("*")]
+
     def _check(self, scene: set[Path], targets: list[Path]) -> None:
         for target in targets:
             if target.resolve() in scene:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from pxr import Sdf, Usd, UsdGeom
 
 from warpmag.errors import InputError
-from warpmag.usd.paths import path_between
+from warpmag.usd.paths import full_path, path_between
 from warpmag.usd.read.ball_instancers import BallInstancer
 from warpmag.usd.read.clock import stage_clock
 from warpmag.usd.read.identical_balls import MOMENTS_PRIMVAR
@@ -27,7 +27,7 @@ from warpmag.usd.read.input_errors import usd_errors
 from warpmag.usd.read.opening import copied_metadata
 from warpmag.usd.read.recording import ORIENT, SCALE, TRANSLATE
 from warpmag.usd.read.session import INSTANCES, added_layer, as_written, instances_around, unsaved_layers
-from warpmag.usd.read.trial_read import trial_read
+from warpmag.usd.read.trial_read import mark_readable, trial_read
 from warpmag.usd.read.units import units_of
 from warpmag.usd.write import crate
 from warpmag.usd.write.columns import BODY, CIRCUIT, MAGNET, Column
@@ -174,23 +174,21 @@ class CacheWriter:
         """Bring the files of a resumed run back to its checkpoint. A run that is refused does not come here."""
         with self._output.errors(self._output.cache):
             samples.drop_later_frames()
-        self._check_cache()
+        self._open_cache("cannot be resumed, it has changed since the run wrote it")  # perhaps damage to the disk
         for target in (*self._write_scene_and_root(), self._output.root):
             self._output.place(target)
 
-    def _check_cache(self) -> None:
-        """Raise :class:`InputError` if USD cannot read the cache, for example after damage to the disk."""
-        cache, message = str(self._output.cache), "cannot be resumed, it has changed since the run wrote it"
+    def _open_cache(self, message: str) -> Sdf.Layer:
+        """Open the cache of an earlier run; raise :class:`InputError` with ``message`` if USD cannot read it."""
+        cache = str(self._output.cache)
         if reason := trial_read(cache):
             raise InputError(f"{cache}: {message} ({reason})")
         with usd_errors(cache, message):
-            Sdf.Layer.OpenAsAnonymous(cache)
+            return Sdf.Layer.OpenAsAnonymous(cache)
 
     def _completed(self) -> PreviousRun:
         """Return a complete run, which has no checkpoint."""
-        path = self._output.cache
-        with usd_errors(str(path)):
-            cache = Sdf.Layer.OpenAsAnonymous(str(path)) if path.exists() else None
+        cache = self._open_cache("cannot be resumed") if self._output.cache.exists() else None
         run = cache.customLayerData.get("warpmag") if cache else None
         if run is None:
             raise InputError(f"{self._output.root}: nothing to resume, no run of this version has written it")
@@ -290,6 +288,8 @@ class CacheWriter:
         for path in (output.beside(".scene.usdc"), output.instances, output.cache, output.root):
             if layer := Sdf.Layer.Find(str(path)):  # an earlier result that this process has open
                 layer.Reload(force=True)
+        scene = [layer.realPath for layer in self._stage.GetUsedLayers() if layer.realPath]
+        mark_readable(full_path(output.root), [*output.files(), *scene])  # the scene has been tried
 
     # ---------------------------------------------------------------------------------------------------------------
 

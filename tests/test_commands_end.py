@@ -1,0 +1,285 @@
+"""Every command and every function that reads a stage ends: on hostile stages in one line, and soon after a signal."""
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from pxr import Sdf
+
+import warpmag
+from warpmag import cli
+from warpmag.engine.stepping.scene import import_scene
+from warpmag.errors import InputError
+from warpmag.scenes_usd import balls_up
+from warpmag.show import blender
+from warpmag.usd import open_animated, open_stage
+from warpmag.usd.read import trial_read
+
+COMMANDS = {
+    "run": ["run", "SCENE", "-o", "OUT/run.usda", "--frames", "1", "--device", "cpu"],
+    "check": ["check", "SCENE"],
+    "render": ["render", "SCENE", "-o", "OUT/picture.png", "--size", "16x9", "--device", "cpu"],
+    "render final": ["render", "SCENE", "-o", "OUT/picture.png", "--quality", "final"],
+    "export": ["export", "SCENE", "-o", "OUT/out.usdc"],
+    "export package": ["export", "SCENE", "-o", "OUT/out.usdz"],
+    "export page": ["export", "SCENE", "-o", "OUT/out.html"],
+    "export numbers": ["export", "SCENE", "-o", "OUT/out.npz"],
+}
+FUNCTIONS = {
+    "open_stage": open_stage,
+    "open_animated": open_animated,
+    "check": warpmag.check,
+    "import_scene": import_scene,
+    "Simulation": lambda path: warpmag.Simulation(path, device="cpu"),
+    "render": lambda path: warpmag.render(path, path.with_name("picture.png"), size=(16, 9), device="cpu"),
+    "export": lambda path: warpmag.export(path, path.with_name("out.usdc")),
+    "render_final": lambda path: blender.render_final(path, path.with_name("picture.png")),
+}
+HEAD = "#usda 1.0\n"
+DEEP = HEAD + "(customLayerData = " + "{ dictionary a = " * 100_000 + "{}" + "}" * 100_000 + ")\n"
+VARIABLE = '(expressionVariables = {string X = "odd.usda"}\nsubLayers = [@./between.usda@])\n'
+
+
+def sublayer(folder, text):
+    (folder / "scene.usda").write_text(f"{HEAD}(subLayers = [@./scene0.usda@, @./odd.usda@])\n")
+    if text:
+        (folder / "odd.usda").write_text(text)
+    else:
+        os.mkfifo(folder / "odd.usda")
+
+
+def crashing(folder):
+    """A layer on which USD crashes."""
+    sublayer(folder, DEEP)
+
+
+def pipe(folder):
+    """A layer that is a pipe, by its name."""
+    sublayer(folder, "")
+
+
+def computed_pipe(folder):
+    """A layer that is a pipe, whose name is known only after composition."""
+    os.mkfifo(folder / "odd.usda")
+    (folder / "scene.usda").write_text(HEAD + VARIABLE)
+    (folder / "between.usda").write_text(f'{HEAD}(subLayers = [@./scene0.usda@, @`"./${{X}}"`@])\n')
+
+
+def textured(folder, name, kind="asset", time=None):
+    value = f" = {name}" if time is None else f".timeSamples = {{{time}: {name}}}"
+    (folder / "between.usda").write_text(
+        f'{HEAD}def Material "Odd" {{\ndef Shader "Picture" {{\nuniform token info:id = "UsdUVTexture"\n'
+        f"{kind} inputs:file{value}\n}}\n}}\n"
+    )
+    variables = '(expressionVariables = {string X = "zero"}\nsubLayers = [@./scene0.usda@, @./between.usda@])\n'
+    (folder / "scene.usda").write_text(HEAD + variables)
+
+
+def texture(folder):
+    """A texture of a device, by its name."""
+    textured(folder, "@/dev/zero@")
+
+
+def sampled_texture(folder):
+    """A texture of a device, in a time sample."""
+    textured(folder, "@/dev/zero@", time=5)
+
+
+def computed_texture(folder):
+    """A texture of a device, whose name is known only after composition."""
+    textured(folder, '@`"/dev/${X}"`@')
+
+
+def computed_textures(folder):
+    """An array of textures of devices, in a time sample, whose names are known only after composition."""
+    textured(folder, '[@`"/dev/${X}"`@]', kind="asset[]", time=5)
+
+
+def computed_metadata(folder):
+    """An asset in metadata that is a pipe, whose name is known only after composition: a package would contain it."""
+    os.mkfifo(folder / "zero")
+    textured(folder, "@@")
+    odd = f'{HEAD}def "More" (customData = {{asset a = @`"./${{X}}"`@}}) {{\ndouble x = 1\n}}\n'
+    (folder / "between.usda").write_text(odd)
+
+
+def damaged(folder):
+    """A binary file cut short."""
+    layer = Sdf.Layer.FindOrOpen(str(folder / "scene0.usda"))
+    layer.Export(str(folder / "whole.usdc"))
+    content = (folder / "whole.usdc").read_bytes()
+    (folder / "scene.usda").write_text(f"{HEAD}(subLayers = [@./odd.usdc@])\n")
+    (folder / "odd.usdc").write_bytes(content[: len(content) * 2 // 3])
+
+
+def lost_variants(folder):
+    """A binary layer with damaged variants."""
+    shutil.copy(Path(__file__).parent / "fuzz" / "lost_variants.usdc", folder / "odd.usdc")
+    (folder / "scene.usda").write_text(f"{HEAD}(subLayers = [@./odd.usdc@])\n")
+
+
+REGULAR = "is not a regular file"
+HOSTILE = {
+    crashing: "USD's reader crashes on it (SIGSEGV)",
+    pipe: REGULAR,
+    computed_pipe: "USD did not read it within 1 s",
+    texture: REGULAR,
+    sampled_texture: REGULAR,
+    computed_texture: REGULAR,
+    computed_textures: REGULAR,
+    computed_metadata: REGULAR,
+    damaged: "",
+    lost_variants: "damaged: ",
+}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    path = tmp_path_factory.mktemp("scene") / "scene0.usda"
+    balls_up.author(path, columns=1, rows=1, layers=1)
+    return path
+
+
+@pytest.fixture
+def folder(scene, tmp_path, monkeypatch):
+    """A folder with the scene; children are given one second, and final pictures a Python."""
+    shutil.copy(scene, tmp_path)
+    monkeypatch.setattr(trial_read, "_SECONDS", 1.0)
+    monkeypatch.setenv(blender.BLENDER, sys.executable)
+    return tmp_path
+
+
+def forked(action, messages, on_start=lambda process: None, seconds=60.0):
+    """The exit status of an action in a forked process, which writes its standard files to ``messages``."""
+    process = os.fork()
+    if not process:
+        code = 99
+        try:
+            file = os.open(messages, os.O_WRONLY | os.O_CREAT)
+            os.dup2(file, 1)
+            os.dup2(file, 2)
+            sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
+            code = action()
+        except InputError as error:
+            print(error, file=sys.stderr)
+            code = cli.BAD_INPUT
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+    try:
+        on_start(process)
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            ended, status = os.waitpid(process, os.WNOHANG)
+            if ended:
+                return os.waitstatus_to_exitcode(status)
+            time.sleep(0.01)
+    except BaseException:
+        os.kill(process, signal.SIGKILL)
+        raise
+    os.kill(process, signal.SIGKILL)
+    os.waitpid(process, 0)
+    return "it did not end"
+
+
+def command_of(name, scene):
+    places = {"SCENE": str(scene)}
+    return [places.get(word, word.replace("OUT", str(scene.parent))) for word in COMMANDS[name]]
+
+
+@pytest.mark.parametrize("kind", HOSTILE, ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_hostile_stage_is_one_line_of_each_command(name, kind, folder):
+    kind(folder)
+    code = forked(lambda: cli.main(command_of(name, folder / "scene.usda")), folder / "messages")
+    lines = (folder / "messages").read_text().splitlines()
+    assert (code, len(lines)) == (cli.BAD_INPUT, 1), (code, lines)
+    assert lines[0].startswith("warpmag: ") and HOSTILE[kind] in lines[0]
+
+
+@pytest.mark.parametrize("kind", [crashing, computed_pipe], ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_hostile_stage_is_one_line_of_each_function(name, kind, folder):
+    kind(folder)
+    code = forked(lambda: FUNCTIONS[name](folder / "scene.usda") and 0, folder / "messages")
+    lines = (folder / "messages").read_text().splitlines()
+    assert code == cli.BAD_INPUT and HOSTILE[kind] in lines[-1], (code, lines)  # Warp has introduced itself
+
+
+def swapped(folder):
+    """The result of a run whose scene another has replaced."""
+    run = cli.main(["run", str(folder / "scene0.usda"), "-o", str(folder / "scene.usda"), "--frames", "1"])
+    assert run == 0
+    (folder / "scene0.usda").write_text(DEEP)
+
+
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "run"])
+def test_a_result_over_a_hostile_scene_is_one_line(name, folder):
+    swapped(folder)
+    code = forked(lambda: cli.main(command_of(name, folder / "scene.usda")), folder / "messages")
+    (line,) = (folder / "messages").read_text().splitlines()
+    assert code == cli.BAD_INPUT and line.endswith("USD's reader crashes on it (SIGSEGV)")
+
+
+@pytest.mark.parametrize("hostile", ["pipe", "text", "link"])
+def test_resume_reads_no_hostile_cache(hostile, folder):
+    """The cache of a complete run, which has no checkpoint."""
+    command = ["run", str(folder / "scene0.usda"), "-o", str(folder / "out.usda"), "--frames", "1", "--device", "cpu"]
+    assert cli.main(command) == 0
+    cache = folder / "out.cache.usdc"
+    cache.unlink()
+    if hostile == "pipe":
+        os.mkfifo(cache)
+    elif hostile == "link":
+        cache.symlink_to("/dev/zero")
+    else:
+        cache.write_text(DEEP)
+    code = forked(lambda: cli.main([*command, "--resume"]), folder / "messages")
+    (line,) = (folder / "messages").read_text().splitlines()
+    reason = "brackets are nested" if hostile == "text" else REGULAR
+    assert code == cli.BAD_INPUT and "cannot be resumed" in line and reason in line
+
+
+@pytest.fixture
+def trials(monkeypatch):
+    """Stages that children have read."""
+    paths, run = [], subprocess.run
+
+    def noted(command, **options):
+        if command[3] == trial_read.__file__:
+            paths.append(Path(command[5]).name)
+        return run(command, **options)
+
+    monkeypatch.setattr(subprocess, "run", noted)
+    return paths
+
+
+@pytest.mark.parametrize("name", [*COMMANDS, "run and export"])
+def test_each_command_tries_a_stage_once(name, folder, trials, capsys):
+    """Although some open it twice. A result of the same process needs no trial."""
+    Sdf.Layer.FindOrOpen(str(folder / "scene0.usda")).Export(str(folder / "scene.usdc"))
+    command = command_of(name.split()[0] if "and" in name else name, folder / "scene.usdc")
+    cli.main([*command, "--for", "render"] if "and" in name else command)
+    assert trials == ["scene.usdc"]
+
+
+def test_a_stage_is_tried_again_when_a_file_changes(folder, trials):
+    """One that its root layer names, directly or not, or that did not exist."""
+    (folder / "scene.usda").write_text(f"{HEAD}(subLayers = [@./between.usda@])\n")
+    (folder / "between.usda").write_text(f"{HEAD}(subLayers = [@./scene0.usda@, @./odd.usda@])\n")
+    texts = {"scene0.usda": (folder / "scene0.usda").read_text() + "\n", "odd.usda": HEAD, "between.usda": HEAD}
+    with contextlib.suppress(InputError):  # a missing layer
+        open_stage(folder / "scene.usda")
+    for count, (name, text) in enumerate(texts.items(), 2):
+        (folder / name).write_text(text)
+        for _ in range(2):
+            with contextlib.suppress(InputError):
+                open_stage(folder / "scene.usda")
+        assert len(trials) == count, name
