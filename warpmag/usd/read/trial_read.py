@@ -156,12 +156,26 @@ def _irregular_dependency(path: str, seen: set[str]) -> str:  # pragma: no cover
     return ""
 
 
+def _read_values(layer) -> None:  # pragma: no cover - runs in the child
+    """Read all values of a layer, prim by prim, so that those of a long recording need little memory."""
+    from pxr import Sdf  # noqa: PLC0415 - only the child needs it
+
+    paths: list = []
+    layer.Traverse("/", paths.append)
+    copy = Sdf.Layer.CreateAnonymous(".usda")
+    without_children = (lambda *_: True, lambda field, *_: field != "primChildren")
+    Sdf.CopySpec(layer, "/", copy, "/", *without_children)
+    for path in (path for path in paths if path.IsPrimPath()):
+        has_children = bool(layer.GetPrimAtPath(path).nameChildren)
+        Sdf.CopySpec(layer, path, copy, "/Trial", *without_children[: 2 * has_children])
+
+
 def _read(path: str, most_prims: int, files: set[str]) -> str:  # pragma: no cover - runs in the child
     """Read a stage up to the last value of its layers; return the reason to reject it, or an empty text.
 
     Add the names of its files to ``files``.
     """
-    from pxr import Sdf, Usd, UsdUtils  # noqa: PLC0415 - only the child needs it
+    from pxr import Usd, UsdUtils  # noqa: PLC0415 - only the child needs it
 
     if reason := _irregular_dependency(path, files):
         return reason
@@ -176,7 +190,7 @@ def _read(path: str, most_prims: int, files: set[str]) -> str:  # pragma: no cov
             attribute.Get()
             attribute.GetTimeSamples()  # never ends where offsets of layers overflow
     for layer in (layer for layer in stage.GetUsedLayers() if layer.GetFileFormat().formatId != "usda"):
-        Sdf.Layer.CreateAnonymous(".usda").TransferContent(layer)
+        _read_values(layer)
     _, assets, _ = UsdUtils.ComputeAllDependencies(path)  # also evaluates expressions
     files |= set(assets)
     return next(filter(None, map(irregular_file, assets)), "")
