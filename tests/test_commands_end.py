@@ -1,6 +1,8 @@
 """Every command and every function that reads a stage ends: on hostile stages in one line, and soon after a signal."""
 
+import collections
 import contextlib
+import itertools
 import os
 import shutil
 import signal
@@ -13,11 +15,12 @@ import pytest
 from pxr import Sdf
 
 import warpmag
-from warpmag import cli
+from warpmag import cli, terminal, usd
+from warpmag.engine.stepping import recording
 from warpmag.engine.stepping.scene import import_scene
 from warpmag.errors import InputError
 from warpmag.scenes_usd import balls_up
-from warpmag.show import blender
+from warpmag.show import blender, export, ray_tracing
 from warpmag.usd import open_animated, open_stage
 from warpmag.usd.read import trial_read
 
@@ -283,3 +286,146 @@ def test_a_stage_is_tried_again_when_a_file_changes(folder, trials):
             with contextlib.suppress(InputError):
                 open_stage(folder / "scene.usda")
         assert len(trials) == count, name
+
+
+PHASES = {
+    "run": (cli, "_load"),
+    "check": (usd, "check"),
+    "render": (ray_tracing, "render"),
+    "render final": (blender, "render_final"),
+    "export": (export, "export"),
+    "scenes": (usd, "describe"),
+    "materials": (cli, "_materials"),
+}
+"""Commands, and a function in each that does not return to Python."""
+SIGNALS = ("SIGTERM", "SIGINT", "SIGHUP")
+
+
+def endless(begin):
+    """A loop of iterators that stands for native code: it holds the lock and reads no signals."""
+    collections.deque(itertools.chain(map(os.write, [begin], [b"."]), range(10**13)), maxlen=0)
+
+
+def interrupted(action, number, messages):
+    """The exit status of an action, and the seconds from a signal to it; ``action`` writes a byte when it has begun."""
+    reader, writer = os.pipe()
+    sent = []
+
+    def act():
+        for default in SIGNALS:
+            signal.signal(getattr(signal, default), signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        return action(writer)
+
+    def send(process):
+        os.close(writer)
+        assert os.read(reader, 1) == b"."
+        sent.append(time.monotonic())
+        os.kill(process, number)
+
+    code = forked(act, messages, on_start=send)
+    os.close(reader)
+    return code, time.monotonic() - sent[0]
+
+
+@pytest.mark.parametrize("way", SIGNALS)
+@pytest.mark.parametrize("name", PHASES)
+def test_a_signal_ends_native_code_of_each_command(name, way, folder, monkeypatch):
+    """In about a second; the limit is for a loaded machine."""
+    module, function = PHASES[name]
+
+    def act(begin):
+        setattr(module, function, lambda *_, **__: endless(begin))
+        return cli.main(command_of(name, folder / "scene0.usda") if name in COMMANDS else [name])
+
+    code, seconds = interrupted(act, getattr(signal, way), folder / "messages")
+    assert code == -signal.SIGKILL and seconds < 10.0
+    assert (folder / "messages").read_text().splitlines()[-1] == "warpmag: ended by a signal"
+
+
+@pytest.mark.parametrize("way", SIGNALS)
+def test_a_signal_ends_a_trial_read_that_waits(way, folder, monkeypatch):
+    """The command reacts by itself, and leaves no child."""
+    monkeypatch.setattr(trial_read, "_SECONDS", 30.0)
+    computed_pipe(folder)
+
+    def act(begin):
+        run = subprocess.run
+        subprocess.run = lambda *command, **options: (os.write(begin, b"."), run(*command, **options))[1]
+        return cli.main(["check", str(folder / "scene.usda")])
+
+    number = getattr(signal, way)
+    code, seconds = interrupted(act, number, folder / "messages")
+    assert code == 128 + number and seconds < 10.0
+    with pytest.raises(OSError, match="No such device or address"):  # nothing reads the pipe
+        os.open(folder / "odd.usda", os.O_WRONLY | os.O_NONBLOCK)
+
+
+@pytest.mark.parametrize("way", SIGNALS)
+@pytest.mark.parametrize("seconds", [3.0, 60.0])
+def test_a_command_that_reacts_has_time_to_close_its_files(seconds, way, folder, monkeypatch):
+    """Three seconds are enough; a minute is cut to the limit."""
+    monkeypatch.setattr(terminal, "_ENDING", 6.0)
+    number = getattr(signal, way)
+
+    def close_slowly(begin):
+        try:
+            os.write(begin, b".")
+            time.sleep(100.0)
+        finally:
+            end = time.monotonic() + seconds
+            while time.monotonic() < end:
+                time.sleep(0.1)
+
+    def act(begin):
+        cli._materials = lambda _: close_slowly(begin)
+        return cli.main(["materials"])
+
+    code, lasted = interrupted(act, number, folder / "messages")
+    assert code == (128 + number if seconds < 6.0 else -signal.SIGKILL) and lasted < 12.0
+
+
+@pytest.mark.parametrize("way", SIGNALS)
+def test_a_frame_is_written_before_the_end(way, folder):
+    """Python delays a signal while it writes a frame, however long that takes."""
+
+    def act(begin):
+        def write_slowly(_):
+            with recording._signals_delayed():
+                os.write(begin, b".")
+                end = time.monotonic() + 3.0
+                while time.monotonic() < end:
+                    time.sleep(0.1)
+            print("went on")
+
+        cli._materials = write_slowly
+        return cli.main(["materials"])
+
+    number = getattr(signal, way)
+    code, seconds = interrupted(act, number, folder / "messages")
+    assert code == 128 + number and seconds > 2.9
+    assert "went on" not in (folder / "messages").read_text()
+
+
+def test_other_signals_and_other_handlers_are_left_alone(folder):
+    """A program that calls the command keeps its handler, and the guard ends nothing."""
+    handled = []
+
+    def act(begin):
+        for name in (*SIGNALS, "SIGUSR1"):
+            signal.signal(getattr(signal, name), lambda number, _: handled.append(number))
+
+        def wait(_):
+            os.write(begin, b".")
+            for name in (*SIGNALS, "SIGUSR1"):
+                os.kill(os.getpid(), getattr(signal, name))
+            time.sleep(2.5)
+            return len(handled)
+
+        cli._materials = wait
+        return cli.main(["materials"])
+
+    reader, writer = os.pipe()
+    assert forked(lambda: act(writer), folder / "messages") == 4
+    os.close(reader)
+    os.close(writer)

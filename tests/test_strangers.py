@@ -277,31 +277,6 @@ def test_long_lists_end(case, tmp_path):
     assert result.returncode == 2 and message in result.stderr + result.stdout
 
 
-@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGHUP"])
-def test_a_signal_ends_native_code(name, tmp_path):
-    """A loop of iterators stands for native code that does not return to Python: it holds the lock, reads no signals.
-
-    It also prints that it has begun: a signal before it would be handled in order.
-    """
-    (tmp_path / "scene.usda").write_text("#usda 1.0\n")
-    number = getattr(signal, name)
-    program = (
-        "import collections, functools, itertools, signal, sys, warpmag.usd;"
-        f"name = signal.Signals({int(number)}); begin = map(functools.partial(print, flush=True), ['begun']);"
-        "signal.signal(name, signal.default_int_handler if name == signal.SIGINT else signal.SIG_DFL);"
-        "warpmag.usd.check = lambda path: collections.deque(itertools.chain(begin, range(10**13)), maxlen=0);"
-        "from warpmag.cli import main; sys.exit(main(['check', sys.argv[1]]))"
-    )
-    command = [sys.executable, "-c", program, str(tmp_path / "scene.usda")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout.readline() == "begun\n"
-        began = time.monotonic()
-        process.send_signal(number)
-        _, errors = process.communicate(timeout=60)
-    assert process.returncode == -signal.SIGKILL and errors == "warpmag: ended by a signal\n"
-    assert time.monotonic() - began < 20.0  # one second, on a loaded machine
-
-
 SLOW_MODULE = """import os, signal, sys, time
 try:
     os.kill(os.getpid(), {number})

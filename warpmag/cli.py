@@ -27,7 +27,6 @@ with interrupted_silently():
         log,
         open_standard_files,
         quiet_warp,
-        signals_guarded,
         signals_raised,
         silence,
         skip_last_collection,
@@ -147,7 +146,6 @@ def _find_scene(name: str, balls: int | None = None, folder: Path = _OUTPUT_FOLD
     return path, False
 
 
-@signals_guarded()
 def _check(options) -> int:
     from warpmag.usd import check  # noqa: PLC0415
 

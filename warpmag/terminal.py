@@ -10,25 +10,36 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from types import FrameType
 from typing import Any
 
 STOPPED = 128
 """A command that a signal ends exits with this plus the signal's number."""
-_PATIENCE = 1.0
-"""Time after a signal in which Python has to react, before the command is ended [s]."""
+_PATIENCE, _ENDING = 1.0, 10.0
+"""Times in which Python has to react to a signal, and then to end the command, before the command is killed [s]."""
 _GUARD = """
-import os, select, signal, sys
-signals, parent, patience = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
-for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-    signal.signal(number, signal.SIG_IGN)
-while os.read(signals, 1):
-    if not select.select([signals], [], [], patience)[0]:
+import os, select, sys, time
+pipe, command, patience, ending = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]), float(sys.argv[4])
+deadline = None
+while True:
+    now = time.monotonic()
+    if not select.select([pipe], [], [], deadline and max(deadline - now, 0.0))[0]:
         os.write(2, b"warpmag: ended by a signal\\n")
-        os.kill(parent, signal.SIGKILL)
+        os.kill(command, 9)
+        break
+    byte, now = os.read(pipe, 1), time.monotonic()
+    if not byte:
+        break
+    if byte == b"\\0":
+        deadline = now + ending
+    elif str(byte[0]) in sys.argv[5:]:
+        deadline = min(deadline or now + patience, now + patience)
 """
-"""Program of a process that ends the command when native code keeps Python from reacting to a signal."""
+"""Program of a process that kills the command when native code keeps Python from reacting to a signal.
+
+It reads the number of each signal, and 0 when Python has reacted.
+"""
 
 
 class Stopped(KeyboardInterrupt):
@@ -52,31 +63,35 @@ def open_standard_files() -> None:
 
 
 @contextlib.contextmanager
-def signals_guarded() -> Iterator[None]:
-    """End the process soon after a signal even where native code does not return to Python.
+def _signals_guarded(numbers: Collection[signal.Signals]) -> Iterator[None]:
+    """Kill the process soon after a signal to which Python does not react, because native code does not return.
 
-    The C handlers of Python write each signal to a pipe. A child process reads the pipe, and expects a second byte from
-    the Python handler within :data:`_PATIENCE`.
+    The C handlers of Python write each signal to a pipe, and :func:`react` writes 0. A child process reads the pipe.
     """
-    if threading.current_thread() is not threading.main_thread() or not sys.executable or os.name != "posix":
+    if not numbers or not sys.executable or os.name != "posix":
         yield
         return
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
-    command = [sys.executable, "-S", "-E", "-c", _GUARD, str(reader), str(os.getpid()), str(_PATIENCE)]
+    limits = map(str, (reader, os.getpid(), _PATIENCE, _ENDING, *map(int, numbers)))
+    options = {"pass_fds": [reader], "stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL}
+    unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)  # the guard inherits it: it outlives the signals
     try:
-        guard = subprocess.Popen(command, pass_fds=[reader], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        guard = subprocess.Popen([sys.executable, "-S", "-E", "-c", _GUARD, *limits], **options)
+        earlier = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     except OSError:  # no process can be started
         guard = None
-    os.close(reader)
-    earlier = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, unblocked)
+        os.close(reader)
     try:
         yield
     finally:
-        signal.set_wakeup_fd(earlier)
-        os.close(writer)
         if guard:
+            signal.set_wakeup_fd(earlier)
+            guard.kill()
             guard.wait()
+        os.close(writer)
 
 
 def react() -> None:
@@ -112,7 +127,10 @@ def interrupted_silently() -> Iterator[None]:
 
 @contextlib.contextmanager
 def signals_raised() -> Iterator[None]:
-    """Raise :class:`Stopped` for signals that would end the process. Ignored signals stay ignored."""
+    """Raise :class:`Stopped` for signals that would end the process, or kill it. Ignored signals stay ignored.
+
+    The process is killed where native code does not return to Python within a second.
+    """
 
     def stop(number, frame):
         react()
@@ -133,7 +151,8 @@ def signals_raised() -> Iterator[None]:
     for number in replaced:
         signal.signal(number, stop)
     try:
-        yield
+        with _signals_guarded(replaced):
+            yield
     finally:
         for number, handler in replaced.items():
             signal.signal(number, handler)

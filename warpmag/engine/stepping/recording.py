@@ -17,6 +17,7 @@ from warpmag.engine.stepping.statistics import Statistics
 from warpmag.engine.stepping.stepper import Stepper
 from warpmag.errors import ConvergenceWarning, InputError
 from warpmag.moments.ranks import Ranks, errors_on_all_ranks, is_first_rank, on_first_rank
+from warpmag.terminal import react
 from warpmag.usd import CacheWriter
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -190,11 +191,16 @@ def _signals_delayed() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    caught = []
+    caught: list[int] = []
+
+    def delay(number, _):
+        react()
+        caught.append(number)
+
     handlers = {number: signal.getsignal(number) for number in _SIGNALS}
     delayed = [number for number, handler in handlers.items() if handler not in (signal.SIG_IGN, None)]
     for number in delayed:
-        signal.signal(number, lambda number, _: caught.append(number))
+        signal.signal(number, delay)
     try:
         yield
     finally:
