@@ -75,10 +75,11 @@ def expansion_tables(degree: int) -> ExpansionTables:
     )
 
 
-def check_fast(rtol: float):
-    """Raise ``InputError`` if expansions cannot reach a relative error."""
-    if rtol < LEAST_RTOL:
-        raise InputError(f"rtol: the fast multipole method reaches {LEAST_RTOL:g}, got {rtol:g}; use 'direct'")
+def check_fast(rtol: float, share: float = 1.0):
+    """Raise ``InputError`` if expansions cannot reach a ``share`` of the relative error ``rtol``."""
+    least = math.ceil(1e6 * LEAST_RTOL / share - 1e-6) / 1e6
+    if rtol < least:
+        raise InputError(f"rtol: the fast multipole method reaches {least:g}, got {rtol:g}; use 'direct'")
 
 
 def is_fast(pairs: float, count: int, quantity: Quantity, rtol: float, device, launched: bool = False) -> bool:
@@ -182,13 +183,14 @@ def fast_sums_for(method: str, moments, layout, extent: float | None, rtol: floa
     the largest distance between two of them [m], None if unknown; ``rtol`` is the error of the magnetization.
     """
     check_token("method", method, METHODS)
-    share_body, rtol = layout.movable & ~layout.single, _FIELD_SHARE * rtol
+    share_body = layout.movable & ~layout.single
     extent_known = extent is not None or not share_body.any()
     if method == "fmm":
-        check_fast(rtol)
+        check_fast(rtol, _FIELD_SHARE)
         if not extent_known:
             body = layout.bodies[share_body.argmax()]
             raise InputError(f"method: 'fmm' needs body_extent, because the movable body {body} has several moments")
+    rtol *= _FIELD_SHARE
     counts, copies, extent = np.bincount(layout.worlds), layout.copies, extent or 0.0
     pairs = copies * (counts @ counts)
     crowding = _crowding(layout.radii, max(2.0 * moments.largest_radius, extent), rtol)
