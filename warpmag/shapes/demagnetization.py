@@ -129,23 +129,6 @@ class Coupling:
         ratio = (self.radii[:, None] / self.radii[self.neighbor]) ** 3
         return np.concatenate([self.slopes.weight, self.slopes.weight * ratio], axis=1)
 
-    @property
-    def layer_factors(self) -> np.ndarray:
-        """Factors of the differences of cells without neighbors along an axis, shape [n, 3]; 0 for all other cells.
-
-        They are positive for these axes, and negative for the others (``linear_cells.py``).
-        """
-        if self.slopes is None:
-            return np.zeros((len(self.radii), 3))
-        return layer_factors(self.slopes.weight, self.cell_sides)
-
-
-def layer_factors(weights: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Return the factors of :attr:`Coupling.layer_factors`, from weights of neighbors [n, 6] and sides of cells [3]."""
-    alone, size = (weights.reshape(-1, 3, 2) == 0.0).all(axis=2), sides / sides.max()
-    count = alone.sum(axis=1, keepdims=True)
-    return np.where(alone, size / np.maximum(count, 1), -1.0 / size) * ((count > 0) & (count < 3))
-
 
 def pair_law_tensors(positions: np.ndarray, radii: np.ndarray) -> np.ndarray:
     """Return the tensors of the sums over pairs between n balls [1/m³], 0 for a ball itself, shape [n, n, 6]."""

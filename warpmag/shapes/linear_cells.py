@@ -15,11 +15,6 @@ reduce the slopes of cells that differ in volume from their neighbors or from V_
 the operator is not positive. The field that magnetizes a cell is the derivative of the energy: the mean field, plus Dᵀ
 of half the difference of the fields of the halves.
 
-Along an axis without neighbors, as across a sheet of one layer, the difference is the one for which div M = 0, as in
-any linear material: D M = −(l/n) Σ_k D M_k/l_k, with the sides l of the cell, over the axes k with neighbors. The n
-axes without share it. Otherwise the charges of a sheet would lie between its faces instead of on them. That costs
-energy, and the pull of a magnet 5 mm over a plate of 1 mm would be 3 % too weak.
-
 The halves are uniform, but the magnetization they represent is linear. The difference of the two is a sawtooth, whose
 field is H = −M as in a plate. Its energy per volume, μ0 (D M)²/6, remains where div M = 0. So it is subtracted.
 
@@ -32,9 +27,9 @@ geometric mean of the sides of a cell perpendicular to the edge.
 from dataclasses import replace
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array, eye_array
+from scipy.sparse import csr_array, eye_array
 
-from warpmag.shapes.demagnetization import Coupling, Slopes, cuboid_tensors, full_tensors, layer_factors, rotated
+from warpmag.shapes.demagnetization import Coupling, Slopes, cuboid_tensors, full_tensors, rotated
 from warpmag.shapes.lattice import Lattice, Pieces
 from warpmag.shapes.solids import grid
 
@@ -110,7 +105,7 @@ class _Operator:
         shares = (scale / part.sides.prod())[:, None, None]
         self._differences = [-block[inverse.reshape(-1)] * shares for block in half_cell_tensors(offsets, part.sides)]
         self._differences[2][own] += _WITHIN_HALF * np.eye(3)
-        self._slopes = self._all_differences(layer_factors(weight, part.sides))
+        self._slopes = [self._difference(axis) for axis in range(3)]
         self._curls = [self._curl(axis, part.sides) for axis in range(3)]
 
     def entries(self, k: int, j: int) -> tuple[np.ndarray, np.ndarray]:
@@ -131,35 +126,17 @@ class _Operator:
 
     def block(self, k: int, j: int) -> csr_array:
         """Return the operator from component j to component k, shape [n, n]."""
-        by_differences, at_differences, differences = self._differences
-        block = self._matrix(self._of_means[:, k, j])
-        for axis, of_slope in self._slopes[j].items():
-            block += self._matrix(by_differences[:, k, axis]) @ of_slope
-        for axis, at_slope in self._slopes[k].items():
-            field = self._matrix(at_differences[:, axis, j])
-            for other, of_slope in self._slopes[j].items():
-                field += self._matrix(differences[:, axis, other]) @ of_slope
-            block += at_slope.T @ field
+        n = len(self._own)
+        values = (self._of_means, *self._differences)
+        means, by_differences, at_differences, differences = (
+            csr_array((entries[:, k, j], (self.row, self.other)), shape=(n, n)) for entries in values
+        )
+        of_slope, at_slope = self._slopes[j], self._slopes[k].T
+        block = means + by_differences @ of_slope + at_slope @ (at_differences + differences @ of_slope)
         for curl in self._curls:
             if k in curl and j in curl:
                 block -= _CURL * (curl[k].T @ curl[j])
-        return (block + eye_array(len(self._own)) / 3.0 if k == j else block).tocsr()
-
-    def _matrix(self, entries: np.ndarray) -> csr_array:
-        """Return the matrix of the coupling's entries, shape [n, n]."""
-        n = len(self._own)
-        return csr_array((entries, (self.row, self.other)), shape=(n, n))
-
-    def _all_differences(self, factors: np.ndarray) -> list[dict]:
-        """Return D of √V M by the component of M and the axis of the difference; axes without D are left out."""
-        own = [self._difference(axis) for axis in range(3)]
-        alone = [axis for axis in range(3) if (factors[:, axis] > 0.0).any()]
-        results = []
-        for j in range(3):
-            outward = diags_array(np.minimum(factors[:, j], 0.0)) @ own[j]
-            across = {axis: diags_array(np.maximum(factors[:, axis], 0.0)) @ outward for axis in alone}
-            results.append(across | {j: own[j] + across[j] if j in across else own[j]})
-        return results
+        return (block + eye_array(n) / 3.0 if k == j else block).tocsr()
 
     def _difference(self, axis: int) -> csr_array:
         """Return D of √V M along an axis, shape [n, n]."""
