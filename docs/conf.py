@@ -92,10 +92,14 @@ def _commands() -> str:
 def _file(name: str) -> str:
     """Return the text of a file outside this folder. Links to pages are adapted, other links to files removed."""
     text = (ROOT / name).read_text(encoding="utf-8").replace("```mermaid", "```text")
-    text = re.sub(r"\[([^]]+)\]\(docs/([\w/]+\.md)\)", r"[\1](\2)", text)
+    text = re.sub(r"\[([^]]+)\]\(docs/([\w/]+\.md(?:#[\w-]+)?)\)", r"[\1](\2)", text)
     return re.sub(
-        r"\[([^]]+)\]\(([\w.]+)\)",
-        lambda link: f"[{link[1]}]({FILES[link[2]]})" if link[2] in FILES else link[1],
+        r"\[([^]]+)\]\(([\w.]+)(#[\w-]+)?\)",
+        lambda link: (
+            f"[{link[1]}]({FILES[link[2]]}{link[3] or ''})"
+            if link[2] in FILES
+            else link[1]
+        ),
         text,
     )
 
