@@ -178,7 +178,7 @@ def quiet_warp() -> None:
     import warp  # noqa: PLC0415
 
     warp.config.log_level = warp.LOG_ERROR
-    warp.config.enable_backward = False  # gradients are not used, and double the compile time
+    warp.config.enable_backward = False  # gradients are not used, and take time to compile
     with _without_lines("Could not find or load the NVIDIA CUDA driver", "no CUDA-capable device is detected"):
         try:
             warp.init()
