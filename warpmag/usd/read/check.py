@@ -69,7 +69,9 @@ class StageReport:
 
 
 def check(path: str | os.PathLike) -> StageReport:
-    """Return the contents of a stage, with all errors and warnings.
+    """Return the contents of a stage, with the errors and warnings found by reading it.
+
+    The command ``warpmag check`` also builds the model, and reports the errors found there.
 
     Raises:
         InputError: The file cannot be opened as a stage.
