@@ -107,8 +107,9 @@ has {grid[0]} × {grid[1]} cells and the bar {grid[2]} × {grid[3]}:
 {table(["dynamics", *(f"{bar:g} A/m" for bar in BARS)], layouts)}
 
 Other initial directions of M1 = −M2, κ = {STEP:g}: perpendicular to the plane of the balls ("across"), in this plane
-and perpendicular to the bar, and random. Under the weak bar pairs along the field are slow, since a submagnetization
-moves only perpendicular to itself. So M along the axis of the pair changes in second order only. `theta` has no pairs:
+and perpendicular to the bar, and random. Under the weak bar pairs whose axis is parallel to the field are slow. A
+submagnetization moves only perpendicular to itself, so M along this axis changes only in second order of the rotation.
+`theta` has no pairs and is not in the table.
 
 {table(["dynamics", "bar", *crystal_balls.PAIRS], starts)}"""
 
@@ -117,9 +118,9 @@ def _text(image, histories, second) -> str:
     rows = [[f"`{dynamics}`", bar, _outcome(len(errors), errors[-1])] for (dynamics, bar), errors in histories.items()]
     return f"""## Fig. 8: magnetization error over iterations
 
-**Paper:** (a) Kim et al. 2018 do not converge under the strong bar and slowly under the weak one; (b) the paper's
-dynamics "converges fast regardless of the magnetic field strengths"; (c) damping-only LLG does not converge under the
-strong bar and "a little faster" than (a) under the weak one.
+**Paper:** (a) Kim et al. 2018 do not converge under the strong bar, and converge slowly under the weak one. (b) The
+paper's dynamics "converges fast regardless of the magnetic field strengths". (c) Damping-only LLG does not converge
+under the strong bar, and converges "a little faster" than (a) under the weak one.
 
 **Here:** κ is {STEP:g} for all dynamics of pairs and both bars. Pairs start demagnetized, M1 = −M2, perpendicular to
 the plane of the balls. `theta` has an automatic step.

@@ -263,9 +263,10 @@ in weaker fields.
 from M1 = −M2. Each cell has {grid.directions:,} tests. A test ends at e_M ≤ 1e-3, and fails after {MOST_ITERATIONS}
 iterations. It then counts as {MOST_ITERATIONS} in the mean.
 
-κ0 is κ at the multiplier 1: the κ of Fig. 8 for pairs, and k for `theta`. `theta` needs one iteration where the
-multiplier is 1 or the moment saturates, and two elsewhere. At this κ0 `theta-euler` and damping-only LLG fail in weak
-fields (below 0.1 Ms). Damping-only LLG also fails where κ‖H‖ > 2 Ms, the stability limit of its explicit step.
+κ0 is κ at the multiplier 1. It is {STEP:g} for pairs, as in Fig. 8, and {SLOPE:g} for `theta`, which is the slope k.
+`theta` needs one iteration where the multiplier is 1 or the moment saturates, and two elsewhere. At this κ0
+`theta-euler` and damping-only LLG fail in weak fields (below 0.1 Ms). Damping-only LLG also fails where κ‖H‖ > 2 Ms,
+the stability limit of its explicit step.
 
 {image}
 

@@ -23,8 +23,9 @@ equations are the paper's. `python -m bench.paper all` repeats all experiments a
 | Ms, f(H), k | saturation magnetization; magnetization curve; initial slope of the curve, 3 for a ball |
 | M1, M2 | pair of submagnetizations of size Ms of each moment; its magnetization is M = (M1 + M2)/2 |
 | e_M | relative magnetization error, ‖M − f(H)‖/‖f(H)‖ (Eq. 12) |
-| κ | dimensionless step β Δt Ms of a pair |
-| `theta`, `warpmag` | this library: exact, accelerated flow of θ, tanh curve (Eq. 10), Kelvin's force (Eq. 13) |
+| θ | angle of M1 and M2 to the effective field, on either side of it; ‖M‖ = Ms cos θ (`docs/physics/equilibrium.md`) |
+| κ | dimensionless step β Δt Ms, with the rate β of Eqs. 6 and 8 and the time step Δt |
+| `theta`, `warpmag` | this library: exact flow of θ, Anderson mixing, tanh curve (Eq. 10), Kelvin's force (Eq. 13) |
 | `theta-euler`, `paper` | Kim and Han 2022: explicit steps of θ (Eqs. 8, 9), tanh curve, the force of Eq. 4 |
 | `llg`, `kim2018` | Kim et al. 2018: explicit steps of LLG (Eq. 6), clamped curve (Eq. 7), Kelvin's force |
 | `llg-damping` | LLG without precession, clamped curve |

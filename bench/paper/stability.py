@@ -61,23 +61,27 @@ def _text(results: str, seconds: float) -> str:
 of Falling Magnet scatter. With the paper's method the balls of Balls Up settle, the letters stay together, and the
 balls of Falling Magnet cling to the magnet (Figs. 3 to 6).
 
-**Here:** steps are 1 ms long, split into substeps according to the speeds. A run simulates {seconds:g} s, one of
-kim2018 {SHORT * seconds:g} s; speeds after different times are not comparable. A run ends early after {TIME_LIMIT:g} s
-of wall time. The column "end" lists the simulated time.
+**Here:** the scenes are those of `warpmag run`. In Sakura Tree, which is Fig. 6, 2,500 balls fall on a tree with a
+magnet at the end of each branch. Steps are 1 ms long, split into substeps according to the speeds. A run of warpmag
+simulates {seconds:g} s, and a run of kim2018 simulates {SHORT * seconds:g} s. Speeds after different times are not
+comparable. A run ends early after {TIME_LIMIT:g} s of wall time. The column "end" lists the simulated time.
 
 * Method: "warpmag, Eq. 4" is this library's dynamics with the paper's force law. The name of a kim2018 row ends with κ
   and the largest number of field evaluations of an induction. The paper states neither.
-* "Saturated" denotes scenes whose bodies have a lower Ms, so that magnets saturate the bodies near them:
-  {balls["saturation"]:g} A/m in place of 1.7e6 for balls, and {letters["saturation"]:g} A/m for letters, whose magnet
-  has {letters["moment"]:g} A·m² in place of 12. The paper states no strengths. It calls its magnets "excessively
-  strong", and argues in section 6.1 that f'(H) falls as M grows, as it does in bodies that saturate.
-* Induction is converged at e_M ≤ 1e-3. Several substeps may share one field evaluation.
-* A body is "held" if it touches a magnet, directly or through other bodies. Nothing collides with the magnet of
-  Alphabets, so its cells for held bodies are empty.
+* "Saturated" denotes scenes whose bodies have a lower Ms, so that magnets saturate the bodies near them. Ms is
+  {balls["saturation"]:,.0f} A/m for balls and {letters["saturation"]:,.0f} A/m for letters, in place of 1.7e6 A/m. The
+  magnet of the letters then has {letters["moment"]:g} A·m² in place of 12 A·m². The paper states no strengths. It calls
+  its magnets "excessively strong", and argues in section 6.1 that f'(H) falls as M grows, as it does in bodies that
+  saturate.
+* Induction is converged at e_M ≤ 1e-3. Several substeps may share one induction, which then counts once.
+* A body is "held" if it touches a permanent magnet, directly or through other bodies that are not on the ground. Empty
+  cells mean that no body is held: nothing collides with the magnet of Alphabets, and some runs of Table 1 end before a
+  body touches a magnet.
 * Balls Up has no friction, so a ball that hangs on another ball swings without decay, and a single ball can dominate
   the RMS speed. The table also lists the median.
-* "Farthest" is the largest distance of a magnet from the mean initial position, at any time. "Deepest overlap" is
-  relative to the radius of a ball, or half of the smallest dimension of the thinner body.
+* "Farthest" is the largest distance of a moving body from the mean initial position of these bodies. "Deepest overlap"
+  is relative to the radius of a ball, or half of the smallest dimension of the thinner body. These two and the highest
+  speed are maxima over the run. The other speeds and "held" are those at its end.
 
 The force of Eq. 4 on an inducible moment is λ times Kelvin's force, and λ falls from 8 in weak fields to 1 in
 saturation (Fig. 10). Between two moments of different λ, action and reaction differ, so momentum is not conserved. A

@@ -60,7 +60,8 @@ time; the last columns describe the scene at that time. Where "steps" is below {
 cover the start of the scene only, and are not comparable with other rows.
 
 Induction ends at e_M ≤ {RTOL:g} or after 1,000 evaluations. The paper does not state the error at which a magnetization
-is converged. "Until every M converges" may mean until M hardly changes, and slow pairs hardly change long before the
-error is small. In weak fields, before a magnet comes near, pairs do not reach this relative error in 1,000 evaluations.
+is converged. "Until every M converges" may mean until M hardly changes. Slow pairs meet this criterion while their
+error is still large. In weak fields, before a magnet comes near, pairs do not reach e_M ≤ {RTOL:g} in 1,000
+evaluations.
 
 {results}"""

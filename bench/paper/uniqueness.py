@@ -6,6 +6,7 @@ from bench.paper import crystal_balls
 from bench.paper.output import Output, table
 from bench.reference import oracle
 from warpmag.declarations.magnets import DYNAMICS, SATURATION_OF_IRON
+from warpmag.moments.dynamics import STEP
 
 RTOL = 1e-9
 MOST = {"theta": 200, "theta-euler": 3000, "llg": 3000, "llg-damping": 3000}
@@ -27,10 +28,10 @@ def run(output: Output):
 **Paper:** the mean of ‖M_K − M_O‖/‖M_K‖ over the balls is {PAPERS_DEVIATION:g} under the weak bar, with M_K by Kim et
 al. 2018 and M_O by the paper's method.
 
-**Here:** these two methods have different curves. So the first table compares all dynamics on the same curve, in
-float64, to a residual e_M ≤ {RTOL:g} or for {MOST["llg"]:,} iterations. "From Newton" is ‖M − M_N‖/‖M_N‖, with M_N by
-Newton's iteration in float64 that shares no code with the kernels. "From `theta`" is relative to the solution of
-`theta`. All dynamics that converge agree.
+**Here:** κ of pairs is {STEP:g} in both tables. These two methods have different curves. So the first table compares
+all dynamics on the same curve, in float64, to a residual e_M ≤ {RTOL:g} or for {MOST["llg"]:,} iterations. "From
+Newton" is ‖M − M_N‖/‖M_N‖, with M_N by Newton's iteration in float64 that shares no code with the kernels. "From
+`theta`" is relative to the solution of `theta`. All dynamics that converge agree.
 
 {table(["bar", "curve", "dynamics", "iterations", "residual", "from Newton", "from `theta`"], rows)}
 
