@@ -48,7 +48,8 @@ from warpmag.shapes.closed_mesh import check_closed, steps_of, welded, winding_n
 from warpmag.shapes.solids import Solid, Values
 
 AUTOMATIC_COUNT = 729
-"""Largest number of moments of a body at automatic spacing: 9³, see the table above."""
+"""Largest number of moments of a body at automatic spacing: 9³, see the table above. A body of n shapes with c cells
+across may have c³ n, if that is more: 27 for each shape of an inducible body of more than 27 shapes."""
 LEAST_ACROSS = 3
 """Smallest number of cells across an inducible shape at automatic spacing. The test case is a ferrite cube of 20 mm at
 0.5 mm from a plate of 40:40:5 mm. The force is 4 % too small with 3 cells across, and 6 % with 2. More cells are
@@ -237,9 +238,9 @@ def fill(
 
     Args:
         solids: Shapes of one body, posed in its frame. Overlap belongs to the earlier shape.
-        spacing: Distance between moments [m]; 0 chooses it for about, and at most, :data:`AUTOMATIC_COUNT` moments. A
-            shape smaller than the spacing gets one moment. A smaller spacing than the automatic one leaves at least as
-            many cells across a shape.
+        spacing: Distance between moments [m]; 0 chooses it for about, and at most, :data:`AUTOMATIC_COUNT` moments, or
+            ``across``³ for each shape if that is more. A shape smaller than the spacing gets one moment. A smaller
+            spacing than the automatic one leaves at least as many cells across a shape.
         across: Smallest number of cells across a shape at automatic spacing, with flatter cells where necessary, up to
             :data:`FLATTEST`. Thinner shapes have fewer cells across.
         together: True if all shapes share one grid, in the frame of the largest, which tensors between them require. A
