@@ -264,6 +264,13 @@ def test_results_are_the_callers(device):
     assert np.array_equal(kelvin, before)
 
 
+@pytest.mark.parametrize("force", [None, "", "x", 1, np.ones((2, 3)), ["kelvin"]])
+def test_no_force_law(force, device):
+    result = warpmag.solve_induction(**CALLS["solve_induction"], device=device)
+    with pytest.raises(warpmag.InputError, match="^force: .* is not one of kelvin, zeeman$"):
+        result.wrench(force)
+
+
 def test_sources_is_a_deprecated_name(device):
     dipole = [[0.0, 0.0, 0.05]], [[0.0, 0.0, 1.0]]
     expected = call("solve_induction", device, permanent=dipole)

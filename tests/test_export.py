@@ -323,6 +323,12 @@ def test_a_finished_picture_that_cannot_be_is_told_in_a_line(run, monkeypatch):
             render_final(run, run.with_name("a.png"))
     with pytest.raises(InputError, match="frame: .* has frames 0 to 4, got 5"):
         render_final(run, run.with_name("a.png"), frame=5)
+    for frame in ("1", 1.5, True, [1]):
+        with pytest.raises(InputError, match="^frame: must be a whole number, got "):
+            render_final(run, run.with_name("a.png"), frame=frame)
+    for size in (None, 16, (16, 9, 1), "ab", (16.0, 9)):
+        with pytest.raises(InputError, match="^size: must be two whole numbers|^size: must be a whole number"):
+            render_final(run, run.with_name("a.png"), size=size)
 
 
 BLENDER = os.environ.get("WARPMAG_BLENDER", sys.executable if importlib.util.find_spec("bpy") else "")

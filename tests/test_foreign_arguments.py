@@ -348,6 +348,17 @@ def test_steps_without_a_run_have_no_duration(device):
     assert "with output" not in line
 
 
+@pytest.mark.parametrize("step", [-1, 0.5, None, "1", True, np.ones(1)])
+def test_wrong_step_of_statistics(step, device):
+    simulation = simulation_of_two(device)
+    simulation.step()
+    statistics = simulation.finish()
+    with pytest.raises(warpmag.InputError, match="^step: must be "):
+        statistics.milliseconds_since(step)
+    with pytest.raises(warpmag.InputError, match="^details: must be True or False"):
+        statistics.summary(details=step if step is not True else "yes")
+
+
 def test_builder_that_grows_after_its_model(device):
     """Newton's models share lists with their builders; forces are those of the model alone."""
     forces = []

@@ -71,6 +71,13 @@ def test_curve_between_and_beyond_the_points(name):
     assert curve.susceptibility >= slope.max() * (1.0 - 1e-12)
 
 
+@pytest.mark.parametrize("fields", [-1.0, math.nan, [math.inf], "1", None, 1j, [[1.0], [1.0, 2.0]], {1.0}])
+def test_magnetization_of_no_fields(fields):
+    """A negative field gave the cubic of the first two points, continued."""
+    with pytest.raises(InputError, match=f"^{NAMES[0]}: fields must be "):
+        MATERIALS[NAMES[0]].curve.magnetization(fields)
+
+
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("name", NAMES)
 def test_kernels_follow_the_table(name, dtype, device):

@@ -298,6 +298,9 @@ def test_report(tmp_path):
     assert report.contents.bodies == report.contents.colliders == ["/Ball", "/Bar"]
     assert report.contents.kinematic == ["/Bar"]
     assert (report.magnets("inducible"), report.magnets("permanent")) == (["/Ball"], ["/Bar"])
+    for kind in (None, "", "iron", ["inducible"], {}):
+        with pytest.raises(InputError, match="^kind: .* is not one of inducible, permanent"):
+            report.magnets(kind)
     assert (report.meters_per_unit, report.kilograms_per_unit, report.up_axis) == (1.0, 1.0, "Z")
     assert report.contents.magnets["/Ball"].susceptibility == math.inf
 

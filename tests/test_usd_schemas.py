@@ -12,11 +12,22 @@ from pxr import Plug, Sdf, Usd, UsdGeom, UsdPhysics
 
 import warpmag
 from warpmag.declarations.attributes import attributes_of
+from warpmag.declarations.coils import Coil, FieldMap
 from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.declarations.schemas import SCHEMAS
 from warpmag.errors import InputError
 from warpmag.kernels.rigid.bodies import ShapeMagnets
-from warpmag.usd import author_magnet, author_settings, open_stage, read_magnets, schemas
+from warpmag.usd import (
+    author_coil,
+    author_field_map,
+    author_magnet,
+    author_settings,
+    magnet_of,
+    open_stage,
+    read_magnets,
+    schemas,
+    triangulate_concave_faces,
+)
 from warpmag.usd.schema_text import SCHEMA_FILE, schema_text
 
 MAGNETS = {
@@ -140,3 +151,86 @@ def test_authoring_refuses_bad_magnets(magnet):
     stage = Usd.Stage.CreateInMemory()
     with pytest.raises(InputError, match=r"^/Ball: "):
         author_magnet(UsdGeom.Sphere.Define(stage, "/Ball").GetPrim(), magnet)
+
+
+AUTHORS = {
+    author_magnet: Magnet(),
+    author_settings: MagneticSettings(),
+    author_coil: Coil(radius=0.01),
+    author_field_map: FieldMap((0.0,) * 3, (0.01,) * 3, np.ones((2, 2, 2, 3))),
+}
+
+
+def prims():
+    """A stage, and prims by kind of which only the first can be authored."""
+    stage = Usd.Stage.CreateInMemory()
+    ball = UsdGeom.Sphere.Define(stage, "/World/Ball").GetPrim()
+    copy = stage.DefinePrim("/Copy")
+    copy.GetReferences().AddInternalReference("/World")
+    copy.SetInstanceable(True)
+    lost = Usd.Stage.CreateInMemory().DefinePrim("/Ball")
+    proxy = stage.GetPrimAtPath("/Copy/Ball")
+    return stage, {"right": ball, "root": stage.GetPseudoRoot(), "proxy": proxy, "null": Usd.Prim(), "lost": lost}
+
+
+@pytest.mark.parametrize("wrong", ["root", "proxy", "null", "lost", None, "/World/Ball", 3])
+def test_wrong_prim(wrong):
+    stage, kinds = prims()
+    prim, message = kinds.get(wrong, wrong), "is the root of" if wrong in ("root", "proxy") else "must be a valid"
+    for author, record in AUTHORS.items():
+        with pytest.raises(InputError, match=f"^prim: .*{message}[^\n]*$"):
+            author(prim, record)
+    if wrong not in ("root", "proxy"):
+        with pytest.raises(InputError, match="^prim: must be a valid Usd.Prim, got "):
+            magnet_of(prim)
+    assert not stage.GetPrimAtPath("/World/Ball").GetAuthoredAttributes()
+
+
+@pytest.mark.parametrize("author", AUTHORS)
+def test_wrong_record(author):
+    stage, kinds = prims()
+    for record in (None, "magnet", {}, np.ones(3), *(other for key, other in AUTHORS.items() if key is not author)):
+        with pytest.raises(InputError, match=r"^(magnet|settings|coil|field_map): must be a \w+, got [^\n]*$"):
+            author(kinds["right"], record)
+    assert not stage.GetPrimAtPath("/World/Ball").GetAuthoredAttributes()
+
+
+@pytest.mark.parametrize("stage", [None, "scene.usda", 3, Usd.Prim, np.ones(3)])
+def test_wrong_stage(stage):
+    for function in (read_magnets, triangulate_concave_faces):
+        with pytest.raises(InputError, match="^stage: must be a Usd.Stage, got "):
+            function(stage)
+
+
+@pytest.mark.parametrize("time_code", ["x", math.nan, math.inf, [1.0], np.ones(3), True, 1j])
+def test_wrong_time_code(time_code, tmp_path):
+    author_stage(tmp_path / "magnets.usda")
+    with pytest.raises(InputError, match="^time_code: must be "):
+        open_stage(tmp_path / "magnets.usda", time_code)
+
+
+def test_numbers_of_numpy_are_authored():
+    _stage, kinds = prims()
+    numbers = {"saturation": np.float32(1e6), "susceptibility": np.int64(3), "moment_spacing": np.float64(0.5)}
+    author_magnet(kinds["right"], Magnet(**numbers, magnetization=np.array([1, 2, 3])))
+    magnet = magnet_of(kinds["right"])
+    assert {name: getattr(magnet, name) for name in numbers} == numbers
+    assert magnet.magnetization == (1.0, 2.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    "values", [{"magnetization": "x"}, {"magnetization": (1.0, 2.0)}, {"recoil_permeability": -1.0}]
+)
+def test_attributes_of_the_other_kind_are_checked(values):
+    """All of them are authored, so that a stage would have them."""
+    stage, kinds = prims()
+    with pytest.raises(InputError, match="^/World/Ball: (magnetization|recoil permeability): "):
+        author_magnet(kinds["right"], Magnet("inducible", **values))
+    assert not stage.GetPrimAtPath("/World/Ball").GetAuthoredAttributes()
+
+
+@pytest.mark.parametrize("points", [3, 1j, np.array(1.0), None])
+@pytest.mark.parametrize("shape", [{"radius": 0.01}, {"shape": "polyline"}])
+def test_points_of_a_coil_that_are_none(shape, points):
+    with pytest.raises(InputError, match="^coil: points: must be vectors, got "):
+        Coil(**shape, points=points).check("coil")

@@ -10,7 +10,8 @@ from dataclasses import MISSING, dataclass, fields, replace
 from functools import cache
 from typing import Any, Literal, get_type_hints
 
-from warpmag.declarations.checks import check_token, plain_value
+from warpmag.declarations.checks import check_token, plain_value, short_repr
+from warpmag.errors import InputError
 
 NAMESPACE = "warpmag"
 """Namespace of attributes in USD and in Newton models."""
@@ -67,6 +68,12 @@ def attributes_of(record: type) -> tuple[Attribute, ...]:
         default = row.default if field.default is MISSING else field.default
         rows.append(replace(row, field=field.name, default=default))
     return tuple(rows)
+
+
+def check_record(name: str, value: Any, record: type) -> None:
+    """Raise :class:`InputError` unless ``value`` is a record of the class ``record``."""
+    if not isinstance(value, record):
+        raise InputError(f"{name}: must be a {record.__name__}, got {short_repr(value)}")
 
 
 def check_fields(record: Any, owner: str, *names: str) -> None:

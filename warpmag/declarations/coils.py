@@ -203,7 +203,7 @@ class Coil:
                 raise InputError(f"{name}: {size} is given, but a {self.shape} has none")
         if self.shape == "polyline":
             self._check_points(name)
-        elif len(self.points):
+        elif self._count_points(name):
             raise InputError(f"{name}: points are given, but a {self.shape} has none")
         most = self._largest_wire_radius()
         wire = real_number(f"{name}: wire radius", self.wire_radius)
@@ -222,10 +222,16 @@ class Coil:
         elif self.shape == "polyline" and not self.closed:
             raise InputError(f"{name}: resistance is given, but an open polyline is only a part of a circuit")
 
+    def _count_points(self, name: str) -> int:
+        try:
+            return len(self.points)
+        except TypeError:  # of a number, and of a NumPy array without a dimension
+            raise InputError(f"{name}: points: must be vectors, got {short_repr(self.points)}") from None
+
     def _check_points(self, name: str) -> None:
         least = 3 if self.closed else 2
-        if len(self.points) < least:
-            raise InputError(f"{name}: points: must be at least {least}, got {len(self.points)}")
+        if (count := self._count_points(name)) < least:
+            raise InputError(f"{name}: points: must be at least {least}, got {count}")
         check_fields(self, name, "points")
         lengths = np.linalg.norm(np.diff(self._path(), axis=0), axis=1)
         if not lengths.min() >= SIZE_RANGE[0]:

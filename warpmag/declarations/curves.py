@@ -151,9 +151,15 @@ class MagnetizationCurve:
         return float(max(slope.max(), (slope[:-1] + vertex * (2.0 * b + 3.0 * vertex * c)).max()))
 
     def magnetization(self, fields: npt.ArrayLike) -> np.ndarray:
-        """Return the magnetization M [A/m] at internal fields H ≥ 0 [A/m], NumPy, any shape."""
+        """Return the magnetization M [A/m] at internal fields H ≥ 0 [A/m], NumPy, any shape.
+
+        Raises:
+            InputError: A field is negative, or not a finite number.
+        """
         h, m, d = np.array(self.fields), np.array(self.magnetizations), np.array(self.slopes)
-        x = np.asarray(fields, float)
+        x = _real_numbers(self.name, "fields", fields)
+        if (x < 0.0).any():
+            raise InputError(f"{self.name}: fields must be zero or positive, got {x.min():g}")
         k = np.clip(np.searchsorted(h, x, "right") - 1, 0, len(h) - 2)
         span, rise = np.diff(h)[k], np.diff(m)[k]
         t = np.minimum((x - h[k]) / span, 1.0)
@@ -177,8 +183,8 @@ def _slopes(h, m):
     return slope
 
 
-def _numbers(name: str, quantity: str, values) -> np.ndarray:
-    """Return values as a one-dimensional array of finite numbers."""
+def _real_numbers(name: str, quantity: str, values) -> np.ndarray:
+    """Return values as an array of finite numbers, any shape."""
     if getattr(values, "requires_grad", False):
         raise InputError(f"{name}: {quantity} require a gradient, which only curve_points of solve_induction have")
     try:
@@ -188,11 +194,17 @@ def _numbers(name: str, quantity: str, values) -> np.ndarray:
         array = array.astype(float)
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{name}: {quantity} must be real numbers") from None
-    if array.ndim != 1:
-        raise InputError(f"{name}: {quantity} must be a list of numbers, shape [points], got {list(array.shape)}")
     wrong = np.flatnonzero(~np.isfinite(array))
     if len(wrong):
-        raise InputError(f"{name}: {quantity} must be finite, got {array[wrong[0]]:g} at point {wrong[0] + 1}")
+        raise InputError(f"{name}: {quantity} must be finite, got {array.flat[wrong[0]]:g} at point {wrong[0] + 1}")
+    return array
+
+
+def _numbers(name: str, quantity: str, values) -> np.ndarray:
+    """Return values as a one-dimensional array of finite numbers."""
+    array = _real_numbers(name, quantity, values)
+    if array.ndim != 1:
+        raise InputError(f"{name}: {quantity} must be a list of numbers, shape [points], got {list(array.shape)}")
     return array
 
 

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpmag.declarations.checks import short_repr
+from warpmag.declarations.checks import check_token, short_repr
 from warpmag.declarations.curves import MagnetizationCurve
+from warpmag.declarations.magnets import FORCES
 from warpmag.declarations.materials import measured
 from warpmag.errors import ConvergenceWarning, InputError, warn_caller
 from warpmag.moments.arrays import (
@@ -100,6 +101,7 @@ class InductionResult:
             >>> bool(forces[0, 2] > 0.0)  # the balls attract each other along the field
             True
         """
+        check_token("force", force, FORCES)
         if self._system is None:
             raise InputError("wrench: a copied or unpickled result has no moments on a device, call wrench() before")
         system, dtype, count = self._system, self._context.dtype, self._balls.count

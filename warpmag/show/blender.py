@@ -7,7 +7,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from warpmag.declarations.checks import check_count
+from warpmag.declarations.checks import check_count, check_whole, whole_pair
 from warpmag.errors import InputError
 from warpmag.show.export import export
 from warpmag.usd import open_animated, stage_clock, usable_path
@@ -45,7 +45,7 @@ def render_final(
     Raises:
         InputError: Blender is missing or fails, or the stage cannot be read or has no such frame.
     """
-    path = usable_path(output)
+    path, size = usable_path(output), whole_pair("size", size)
     if path.suffix not in _PICTURES:
         raise InputError(f"{path}: a finished picture must end in {' or '.join(_PICTURES)}")
     for name, value in zip(("width", "height", "samples"), (*size, samples), strict=True):
@@ -54,8 +54,10 @@ def render_final(
     clock = stage_clock(open_animated(stage)[0])
     per_code = clock.frames_per_second / clock.time_codes_per_second
     last = round((clock.end - clock.start) * per_code)
-    if frame is not None and not 0 <= frame <= last:
-        raise InputError(f"frame: {stage} has frames 0 to {last}, got {frame}")
+    if frame is not None:
+        check_whole("frame", frame)
+        if not 0 <= frame <= last:
+            raise InputError(f"frame: {stage} has frames 0 to {last}, got {frame}")
     code = round(clock.start * per_code) + (last if frame is None else frame)
     with tempfile.TemporaryDirectory() as folder:
         exported, drawn = Path(folder) / "stage.usdc", Path(folder) / f"picture{path.suffix}"

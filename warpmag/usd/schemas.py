@@ -15,13 +15,13 @@ import numpy as np
 from pxr import Gf, Plug, Sdf, Usd, UsdGeom, Vt
 
 from warpmag.declarations import materials
-from warpmag.declarations.attributes import Attribute, Schema, attributes_of
+from warpmag.declarations.attributes import Attribute, Schema, attributes_of, check_record
 from warpmag.declarations.checks import check_vector
 from warpmag.declarations.curves import MagnetizationCurve
 from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.declarations.schemas import MAGNET_SCHEMA, SCENE_SCHEMA
 from warpmag.errors import InputError
-from warpmag.usd.values import flag, number, point_array, text, vector, vector_array, whole_numbers
+from warpmag.usd.values import check_prim, flag, number, point_array, text, vector, vector_array, whole_numbers
 
 Plug.Registry().RegisterPlugins(str(Path(__file__).parent.absolute() / "schema"))
 
@@ -47,11 +47,14 @@ _READERS: dict[str, Callable[[str, Any], Any]] = {
 }
 """Functions that convert the value of a USD attribute to the value of a field, by USD type."""
 _TO_USD: dict[str, Callable[[Any], Any]] = {
-    "vector3f": lambda value: Gf.Vec3f(*value),
-    "point3f": lambda value: Gf.Vec3f(*value),
+    "float": float,
+    "double": float,
+    "bool": bool,
+    "vector3f": lambda value: Gf.Vec3f(*map(float, value)),
+    "point3f": lambda value: Gf.Vec3f(*map(float, value)),
     "int3": lambda value: Gf.Vec3i(*value),
     "vector3f[]": lambda value: Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(value, np.float32).reshape(-1, 3)),
-    "point3f[]": lambda value: Vt.Vec3fArray([Gf.Vec3f(*point) for point in value]),
+    "point3f[]": lambda value: Vt.Vec3fArray([Gf.Vec3f(*map(float, point)) for point in value]),
 }
 """Functions that convert the value of a field to the value of a USD attribute; other USD types need none."""
 
@@ -62,7 +65,9 @@ def author_magnet(prim: Usd.Prim, magnet: Magnet) -> None:
     Attributes without effect on this magnet are left out: a recoil permeability of 1, a conductivity of 0, and
     attributes that a measured curve sets.
     """
-    magnet.check(str(prim.GetPath()))
+    check_prim(prim, authored=True)
+    check_record("magnet", magnet, Magnet)
+    magnet.check(str(prim.GetPath()), unused=True)
     measured = isinstance(magnet.curve, MagnetizationCurve)
     prim.AddAppliedSchema(MAGNET_API)
     for row in attributes_of(Magnet):
@@ -76,6 +81,8 @@ def author_magnet(prim: Usd.Prim, magnet: Magnet) -> None:
 
 def author_settings(prim: Usd.Prim, settings: MagneticSettings) -> None:
     """Author all magnetic settings of the scene on its PhysicsScene ``prim``."""
+    check_prim(prim, authored=True)
+    check_record("settings", settings, MagneticSettings)
     settings.check(str(prim.GetPath()))
     author_schema(prim, SCENE_SCHEMA, vars(settings))
 
@@ -113,6 +120,7 @@ def magnet_of(prim: Usd.Prim) -> Magnet:
     Raises:
         InputError: A value is invalid, or two attributes contradict each other; the message names the prim.
     """
+    check_prim(prim)
     magnet = _with_curve(prim, Magnet(**read_fields(prim, attributes_of(Magnet))))
     material = prim.GetAttribute(MATERIAL).Get()
     if material is not None and text(f"{prim.GetPath()}: {MATERIAL}", material):

@@ -6,10 +6,12 @@ import numbers
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 from pxr import Gf, Tf, Usd, UsdUtils, Vt
 
+from warpmag.declarations.checks import short_repr
 from warpmag.errors import InputError, one_line
 
 LARGEST = float(np.finfo(np.float32).max)
@@ -104,6 +106,20 @@ def quiet() -> Iterator[None]:
         yield
     finally:
         del silencer
+
+
+def check_prim(prim: Any, *, authored: bool = False) -> None:
+    """Raise :class:`InputError` unless ``prim`` is a prim of a stage, and one to author if ``authored`` is True."""
+    if not (isinstance(prim, Usd.Prim) and prim.IsValid()):
+        raise InputError(f"prim: must be a valid Usd.Prim, got {short_repr(prim)}")
+    if authored and (prim.IsPseudoRoot() or prim.IsInstanceProxy() or prim.IsInPrototype()):
+        raise InputError(f"prim: {prim.GetPath()} is the root of its stage or in an instance, and cannot be authored")
+
+
+def check_stage(stage: Any) -> None:
+    """Raise :class:`InputError` unless ``stage`` is a stage of USD."""
+    if not isinstance(stage, Usd.Stage):
+        raise InputError(f"stage: must be a Usd.Stage, got {short_repr(stage)}")
 
 
 def finding_of(where: str, error: InputError) -> Finding:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
+from warpmag.declarations.checks import check_flag, check_not_negative, check_whole
 from warpmag.engine.stepping.stepper import StepReport
 from warpmag.errors import InputError
 
@@ -97,6 +98,8 @@ class Statistics:
 
     def milliseconds_since(self, step: int) -> tuple[float, float, float]:
         """Return :attr:`milliseconds` of the steps from index ``step`` on."""
+        check_whole("step", step)
+        check_not_negative("step", step)
         seconds = np.array(self._seconds, dtype=float).reshape(-1, len(_UNTIMED))[step:]
         timed = seconds[np.isfinite(seconds).all(axis=1)]
         return tuple((1e3 * timed.mean(axis=0)).tolist()) if len(timed) else (0.0, 0.0, 0.0)
@@ -137,6 +140,7 @@ class Statistics:
         Args:
             details: Include the times of a step, field evaluations, substeps and buffer growths.
         """
+        check_flag("details", details)
         if not self.steps:
             return ["no steps"]
         lines = [

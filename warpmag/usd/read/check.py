@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 
 from pxr import Tf, Usd, UsdGeom, UsdValidation
 
+from warpmag.declarations.checks import check_token
+from warpmag.declarations.magnets import KINDS
 from warpmag.errors import InputError, warn_caller
 from warpmag.usd.read.ball_instancers import BallInstancer, ball_instancers
 from warpmag.usd.read.clock import StageClock, stage_clock, stage_name
@@ -65,6 +67,7 @@ class StageReport:
 
     def magnets(self, kind: str) -> list[str]:
         """Return the paths of the magnets of one kind, ``inducible`` or ``permanent``."""
+        check_token("kind", kind, KINDS)
         return [path for path, magnet in self.contents.magnets.items() if magnet.kind == kind]
 
 

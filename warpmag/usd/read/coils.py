@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from pxr import Gf, Usd, UsdGeom
 
-from warpmag.declarations.attributes import Schema, attributes_of
+from warpmag.declarations.attributes import Schema, attributes_of, check_record
 from warpmag.declarations.coils import Coil, FieldMap, check_strength
 from warpmag.declarations.keys import Keys
 from warpmag.declarations.schemas import COIL_SCHEMA, FIELD_MAP_SCHEMA
@@ -21,7 +21,7 @@ from warpmag.usd.read.keys import KeyReader
 from warpmag.usd.read.prims import body_of
 from warpmag.usd.read.transforms import SCALE_TOLERANCE, TransformCheck
 from warpmag.usd.schemas import author_schema, has_api, read_fields, world_matrix
-from warpmag.usd.values import Finding, finding_of, instance_finding, number
+from warpmag.usd.values import Finding, check_prim, finding_of, instance_finding, number
 
 Source = TypeVar("Source", Coil, FieldMap)
 _AMPERE_TURNS, _VOLTAGE = (COIL_SCHEMA.usd_name(field) for field in ("ampere_turns", "voltage"))
@@ -45,12 +45,16 @@ class PlacedSource:
 
 def author_coil(prim: Usd.Prim, coil: Coil) -> None:
     """Make ``prim`` a coil, with every attribute authored."""
+    check_prim(prim, authored=True)
+    check_record("coil", coil, Coil)
     coil.check(str(prim.GetPath()))
     author_schema(prim, COIL_SCHEMA, vars(coil))
 
 
 def author_field_map(prim: Usd.Prim, field_map: FieldMap) -> None:
     """Make ``prim`` a field map, with every attribute authored."""
+    check_prim(prim, authored=True)
+    check_record("field_map", field_map, FieldMap)
     field_map.check(str(prim.GetPath()))
     author_schema(prim, FIELD_MAP_SCHEMA, vars(field_map) | {"counts": np.shape(field_map.values)[:3]})
 

@@ -7,10 +7,12 @@ and the layers of a run keep the faces of the artist. Values of faces and of the
 import numpy as np
 from pxr import Usd, UsdGeom, Vt
 
+from warpmag.declarations.checks import check_flag
 from warpmag.errors import InputError
 from warpmag.shapes.polygons import faces_of_triangles, fans, triangulate
 from warpmag.usd.read.prims import is_collider
 from warpmag.usd.read.session import editable, instance_findings, instances_around
+from warpmag.usd.values import check_stage
 
 
 def triangulate_concave_faces(stage: Usd.Stage, *, visuals: bool = True) -> None:
@@ -21,8 +23,10 @@ def triangulate_concave_faces(stage: Usd.Stage, *, visuals: bool = True) -> None
         visuals: Also replace meshes that do not collide.
 
     Raises:
-        InputError: A concave face is in an instance with an override that USD ignores.
+        InputError: A concave face is in an instance with an override that USD ignores, or an argument is wrong.
     """
+    check_stage(stage)
+    check_flag("visuals", visuals)
     prims = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
     meshes = [prim.GetPath() for prim in prims if prim.IsA(UsdGeom.Mesh) and (visuals or is_collider(prim))]
     with Usd.EditContext(stage, stage.GetSessionLayer()):

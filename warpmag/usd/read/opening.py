@@ -6,6 +6,7 @@ would fetch textures from network addresses. Layers of the session therefore hol
 unchanged.
 """
 
+import math
 import os
 import re
 from collections.abc import Sized
@@ -14,6 +15,7 @@ from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdGeom
 
+from warpmag.declarations.checks import real_number
 from warpmag.errors import InputError
 from warpmag.usd.paths import full_path, usable_path
 from warpmag.usd.read.ball_instancers import BallInstancer, ball_instancers
@@ -49,8 +51,12 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
         additions are in its session.
 
     Raises:
-        InputError: The file is missing, is not USD or does not compose.
+        InputError: The file is missing, is not USD or does not compose, or ``time_code`` is not a finite number.
     """
+    if time_code is not None:
+        time_code = real_number("time_code", time_code)
+        if not math.isfinite(time_code):
+            raise InputError(f"time_code: must be finite, got {time_code}")
     stage, deferred = open_deferred(path, time_code)
     with usd_errors(str(path)):
         complete_instances(deferred)

@@ -26,7 +26,7 @@ from warpmag.usd.read.session import instance_findings, instances_around, unsave
 from warpmag.usd.read.transforms import TransformCheck
 from warpmag.usd.read.unused_attributes import kind_findings, stray_findings
 from warpmag.usd.schemas import MAGNET_API, SCENE_API, has_api, magnet_of, moment_of, settings_of
-from warpmag.usd.values import Finding, attribute_findings, declaration_findings, finding_of, quiet
+from warpmag.usd.values import Finding, attribute_findings, check_stage, declaration_findings, finding_of, quiet
 
 
 @dataclass
@@ -50,8 +50,9 @@ def read_magnets(stage: Usd.Stage) -> StageMagnets:
     """Read and check the magnets and the magnetic settings of a stage.
 
     Raises:
-        InputError: The first error of :func:`survey`, naming the prim.
+        InputError: The first error of :func:`survey`, naming the prim, or ``stage`` is not a stage.
     """
+    check_stage(stage)
     contents = survey(stage)
     for finding in contents.findings:
         if finding.severity == "error":
