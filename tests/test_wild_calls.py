@@ -3,13 +3,20 @@
 Six of each by default; as many as wanted with ``python -m tests.fuzz.calls``.
 """
 
+import inspect
 import os
+import re
 import signal
+from importlib import import_module
+from pathlib import Path
 
 import pytest
 from fuzz.calls import caller, children, functions, worlds
+from fuzz.calls.stages import RECORDS
 
 pytestmark = pytest.mark.no_cover  # what is drawn decides no line of the report
+PAGES = Path(__file__).parents[1] / "docs" / "api"
+ENTRY = re.compile(r"^\.\. auto(function|class):: (warpmag\.\S+)\n((?:   :.*\n)*)", re.MULTILINE)
 HEAVY = ("Simulation", "Display")
 """Owners whose construction takes long: half of the calls."""
 
@@ -50,3 +57,26 @@ def test_a_crash_is_seen(monkeypatch):
     assert sorted(results) == [0, 1, 2, 3]
     assert results[2].call == "call 2" and results[2].problem == f"its process ended with the status {signal.SIGKILL:d}"
     assert not any(results[number].problem for number in (0, 1, 3))
+
+
+def documented():
+    """Names of the functions and of the methods with arguments on the pages; those for Isaac Lab need that program."""
+    for page in sorted(set(PAGES.glob("*.md")) - {PAGES / "isaaclab.md"}):
+        for kind, path, options in ENTRY.findall(page.read_text(encoding="utf-8")):
+            place, _, name = path.rpartition(".")
+            if kind == "function":
+                yield f"usd.{name}" if place == "warpmag.usd" else name
+                continue
+            owner, excluded = getattr(import_module(place), name), re.findall(r"\w+", options)
+            if owner in RECORDS or "special-members" in options:
+                yield name  # the records' methods are called by the functions that author them
+            for method, function in vars(owner).items() if ":members:" in options and owner not in RECORDS else ():
+                listed = inspect.isfunction(function) and method[0] != "_" and method not in excluded
+                if listed and len(inspect.signature(function).parameters) > 1:
+                    yield f"{name}.{method}"
+
+
+def test_every_documented_function_is_called():
+    names = set(documented())
+    assert {"h_field", "Magnetics.apply", "SensorMagnetometer", "usd.magnet_of", "Coil"} <= names
+    assert names - set(functions.targets()) == set()

@@ -1,4 +1,4 @@
-"""``python -m tests.fuzz.calls``: wild calls of every public function that takes builders, models, states or arrays.
+"""``python -m tests.fuzz.calls``: wild calls of every documented function and of its results' methods.
 
     python -m tests.fuzz.calls --count 2000 --seed 7           so many calls of each function
     python -m tests.fuzz.calls --count 100 --only apply        of functions with ``apply`` in their names
@@ -27,13 +27,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=200, help="calls of each function (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="which calls (default: %(default)s)")
-    parser.add_argument("--only", default="", help="part of the names of the functions")
+    parser.add_argument("--only", default="", help="part of the names of the functions, between dots for a whole one")
     parser.add_argument("--without", default="-", help="part of the names of functions that are left out")
     parser.add_argument("--workers", type=int, default=1, help="functions at a time (default: %(default)s)")
     options = parser.parse_args()
     for kind in KINDS:  # kernels are compiled before the first fork
         new_world(kind=kind)
-    names = [name for name in targets() if options.only in name and options.without not in name]
+    names = [name for name in targets() if options.only in f".{name}." and options.without not in f".{name}."]
     calls = partial(_all_outcomes, seed=options.seed, count=options.count)
     total = 0
     with multiprocessing.get_context("fork").Pool(options.workers) as pool:

@@ -15,6 +15,7 @@ import warpmag
 
 from .functions import ARRAYS, LIBRARIES, OWNERS, SINGLE, USUAL, targets
 from .results import gradients, numbers, short
+from .stages import INVALID_PRIMS
 from .wild import wild
 from .worlds import KINDS, OFTEN, POINTS, TIME_STEP, new_world
 
@@ -39,7 +40,9 @@ class Caller:
     owners: dict[str, Any] = field(default_factory=dict)
 
     def _owned(self, owner: str) -> Any:
-        """Return an owner of the function, made once for a world."""
+        """Return an owner of the function, made once for a world, or the world itself."""
+        if owner == "world":
+            return self.world
         if owner not in self.owners:
             self.owners[owner] = OWNERS[owner](self.world)
         return self.owners[owner]
@@ -49,6 +52,8 @@ class Caller:
         right = self.world | SINGLE.get(self.name, {})
         if self.name.endswith(".reset"):
             right["worlds"] = np.ones(max(self.world["model"].world_count, 1), bool)
+        if self.name.startswith("usd."):
+            right |= {"stage": self.world["scene_stage"], "coil": self.world["loop"]}
         if self.name == "Simulation.control":
             right["control"] = self._owned("Simulation").model.control()
         if self.world["kind"] == "gradients" and self.name in ARRAYS:
@@ -62,12 +67,14 @@ class Caller:
     def _draw_arguments(self, parameters: Mapping[str, inspect.Parameter], chance: random.Random) -> dict[str, Any]:
         """Return right arguments with wild ones among them."""
         right = self._right()
-        names = [name for name in parameters if name not in ("args", "options", "overlays")]
+        several = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
+        names = [name for name, parameter in parameters.items() if parameter.kind not in several]
         needed = [name for name in names if parameters[name].default is inspect.Parameter.empty]
         needed += [name for name in names if name in USUAL and name not in needed and chance.random() < 0.8]
         arguments = {name: right[name] for name in needed}
+        others = self.world | (INVALID_PRIMS if self.name.startswith("usd.") else {})
         for name in chance.sample(names, min(len(names), chance.choice((0, 1, 1, 1, 2, 3)))):
-            arguments[name] = wild(chance, self.world)
+            arguments[name] = wild(chance, others)
         return arguments
 
     def call(self, number: int, announce: Callable[[str], Any] = lambda _: None) -> Outcome:

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warpmag.declarations.magnets import Magnet
+
 
 def numbers(result: Any) -> Iterator[np.ndarray]:
     """Yield the arrays and numbers of a result."""
@@ -33,7 +35,7 @@ def gradients(result: Any, positions: Any, tape: wp.Tape | None) -> list[np.ndar
 
 def _parts(result: Any) -> list:
     """Return the arrays of a result: of a sequence, of the fields of a dataclass, or itself."""
-    if is_dataclass(result):
+    if is_dataclass(result) and not isinstance(result, Magnet):  # a susceptibility may be infinite
         return [getattr(result, entry.name) for entry in fields(result)]
     return list(result) if isinstance(result, tuple | list) else [result]
 

@@ -1,7 +1,6 @@
 """Worlds of the calls: right arguments by name, which are made anew after a call that changed them."""
 
 import os
-from pathlib import Path
 from typing import Any
 
 import newton
@@ -12,12 +11,12 @@ import warpmag
 from warpmag.declarations.keys import Keys
 from warpmag.moments.probe import FieldProbe
 
+from .stages import new_arguments
+
 M = (0.0, 0.0, 1e6)
 POINTS = np.array([(0.0, 0.0, 0.05), (0.02, 0.0, 0.0)])
 KEYS = Keys(np.array([0.0, 1.0]), np.array([[1.0], [2.0]]), "linear").to_text()
 TIME_STEP = 1e-3  # s
-FOLDER = Path(__file__).parents[1]
-STAGE = str(FOLDER / "workshop.usda")
 OFTEN = 50
 """Calls without arguments after which a world is made anew; calls with arguments make it anew if they were taken."""
 KINDS = "coils", "worlds", "gradients", "distant"
@@ -73,7 +72,7 @@ def new_world(balls: int = 2, kind: str = "coils") -> dict[str, Any]:
         model.warpmag.current_keys[source] = KEYS  # as USD's importer leaves them
     magnetics, state = warpmag.Magnetics(model), model.state()
     magnetics.apply(state, dt=TIME_STEP)
-    return CONSTANTS | {
+    made = {
         "builder": builder,
         "scene": builder,
         "model": model,
@@ -87,6 +86,7 @@ def new_world(balls: int = 2, kind: str = "coils") -> dict[str, Any]:
         "sensor": warpmag.SensorMagnetometer(model, magnetics, "site"),
         "probe": FieldProbe(magnetics.system, 2),
     }
+    return CONSTANTS | new_arguments() | made
 
 
 def _new_parts(balls: int, kind: str) -> tuple[newton.ModelBuilder, int]:
