@@ -20,7 +20,7 @@ M = (0.0, 0.0, 1e6)
 class World:
     """A model of a magnet, a conducting ball, iron, a coil on a body and a site, with all that takes its states."""
 
-    def __init__(self, device):
+    def __init__(self, device, *, solved=True):
         self.builder = builder = new_builder()
         add_ball(builder, (0.0, 0.0, 0.0), M)
         add_ball(builder, (0.0, 0.0, 0.02))
@@ -35,7 +35,8 @@ class World:
         self.viewer = newton.viewer.ViewerNull()
         self.display = warpmag.Display(self.viewer, self.model, self.magnetics)
         self.state = self.model.state()
-        self.magnetics.apply(self.state)
+        if solved:
+            self.magnetics.apply(self.state)
 
     def vectors(self, count, dtype=wp.vec3):
         return wp.zeros(count, dtype=dtype, device=self.model.device)
@@ -61,6 +62,7 @@ OF_STATES = {
     "SensorMagnetometer.update": lambda world, state: world.sensor.update(state),
     "Display.show": lambda world, state: world.display.show(0.0, state),
     "Display.follow": lambda world, state: world.display.follow(0.0, state),
+    "Display.apply_forces": lambda world, state: world.display.apply_forces(state),
 }
 
 
@@ -249,6 +251,54 @@ def test_wrong_array(name, wrong, world):
         call(world, array)
 
 
+WORLDS = {"of several": [0, 0, 0], "none": [], "fractions": [0.5, 0.5], "negative": [-1, 0], "too many": [0, 1]}
+WORLDS |= {"texts": ["a", "b"], "a table": [[0, 0]], "an object": object(), "Warp's": lambda: wp.zeros(7, dtype=int)}
+
+
+@pytest.mark.parametrize("wrong", WORLDS)
+def test_wrong_worlds_of_points(wrong, world):
+    worlds, points = WORLDS[wrong], np.full((2, 3), 0.05)
+    for name in ("probe", "h_field", "b_field", "field_gradient"):
+        with pytest.raises(warpmag.InputError, match="^worlds: "):
+            getattr(world.magnetics, name)(points, worlds=worlds() if callable(worlds) else worlds)
+
+
+@pytest.fixture(scope="module")
+def driven(device):
+    """Magnets of a model whose coil has a voltage."""
+    builder = new_builder()
+    add_ball(builder, (0.0, 0.0, 0.0), M)
+    warpmag.add_coil(builder, radius=0.01, resistance=1.0, turns=5, label="coil")
+    return warpmag.Magnetics(builder.finalize(device=device))
+
+
+@pytest.mark.parametrize("wrong", [*WRONG_ARRAYS, *WRONG_SIZES])
+def test_wrong_voltage(wrong, driven, world):
+    array = world.vectors(wrong, wp.float32) if isinstance(wrong, int) else WRONG_ARRAYS[wrong](world, wp.float32)
+    with pytest.raises(warpmag.InputError, match="^set_voltage: "):
+        driven.set_voltage("coil", array)
+
+
+OF_BUILDERS = {
+    "register_custom_attributes": warpmag.register_custom_attributes,
+    "add_inducible": lambda builder: warpmag.add_inducible(builder, body=0),
+    "add_permanent": lambda builder: warpmag.add_permanent(builder, body=0, magnetization=M),
+    "add_balls": lambda builder: warpmag.add_balls(builder, np.zeros((1, 3)), 0.005),
+    "add_coil": lambda builder: warpmag.add_coil(builder, radius=0.01),
+    "add_field_map": lambda builder: warpmag.add_field_map(
+        builder, origin=(0.0, 0.0, 0.0), spacing=1.0, values=np.zeros((2, 2, 2, 3))
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", [None, "builder", newton.ModelBuilder, "a model", "a state"])
+@pytest.mark.parametrize("name", OF_BUILDERS)
+def test_wrong_builder(name, wrong, world):
+    builder = {"a model": world.model, "a state": world.state}.get(wrong, wrong)
+    with pytest.raises(warpmag.InputError, match="^builder: must be a newton.ModelBuilder, got "):
+        OF_BUILDERS[name](builder)
+
+
 @pytest.mark.parametrize("wrong", ["text", "an object", "a ragged list", "NaN", "of quaternions", *WRONG_SIZES])
 def test_wrong_sharing(wrong, world):
     array = world.vectors(wrong, wp.int32) if isinstance(wrong, int) else WRONG_ARRAYS[wrong](world, wp.int32)
@@ -323,11 +373,38 @@ def test_wrong_control(wrong, device):
         simulation.control = control
 
 
-@pytest.mark.parametrize("name", ["energy", "shape_moments", "h_field", "b_field", "field_gradient"])
-def test_no_result_before_the_first_solve(name, device):
-    magnetics = warpmag.Magnetics(other_model(device, 2))
+@pytest.mark.parametrize("worlds", [[1], [True] * 3, "all", 1, np.ones((1, 1), bool), [[True], [True, False]]])
+def test_wrong_worlds_of_a_reset(worlds, device):
+    with pytest.raises(warpmag.InputError, match="^worlds: "):
+        simulation_of_two(device).reset(worlds)
+
+
+EARLY = {
+    "energy": lambda world: world.magnetics.energy(),
+    "shape_moments": lambda world: world.magnetics.shape_moments(),
+    "sum_moments": lambda world: world.magnetics.sum_moments(),
+    "field_error": lambda world: world.magnetics.field_error(),
+    "workload": lambda world: world.magnetics.workload(),
+    "h_field": lambda world: world.magnetics.h_field([(0.0, 0.0, 1.0)]),
+    "b_field": lambda world: world.magnetics.b_field([(0.0, 0.0, 1.0)]),
+    "field_gradient": lambda world: world.magnetics.field_gradient([(0.0, 0.0, 1.0)]),
+    "add_forces": lambda world: world.magnetics.add_forces(world.state),
+    "a probe": lambda world: world.magnetics.probe([(0.0, 0.0, 1.0)]).measure(),
+    "a probe of the system": lambda world: FieldProbe(world.magnetics.system, 1).measure(),
+    "a sensor": lambda world: world.sensor.update(world.state),
+}
+
+
+@pytest.fixture(scope="module")
+def early(device):
+    return World(device, solved=False)
+
+
+@pytest.mark.parametrize("name", EARLY)
+def test_no_result_before_the_first_solve(name, early):
+    """Forces, moments, probes and sensors were zero without a word."""
     with pytest.raises(warpmag.InputError, match="^Magnetics: there is no field yet"):
-        getattr(magnetics, name)(*([(0.0, 0.0, 1.0)] if "field" in name else []))
+        EARLY[name](early)
 
 
 @pytest.mark.parametrize("magnetization", [(0.0, 0.0, 1e30), (1e16, 0.0, 0.0), (0.0, -3e38, 0.0)])

@@ -133,7 +133,7 @@ class Display:
         check_state(state, self._model, "body_q", "particle_q")
         self.viewer.begin_frame(real_number("time", time))
         self.viewer.log_state(state)
-        if not isinstance(self.viewer, newton.viewer.ViewerNull):
+        if self._magnetics.is_solved and not isinstance(self.viewer, newton.viewer.ViewerNull):
             self._show_arrows(state)
         self.viewer.end_frame()
 

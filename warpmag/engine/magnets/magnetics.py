@@ -64,7 +64,7 @@ class Magnetics:
 
     Attributes:
         magnets: The magnets, in the order of their moments.
-        system: The moments on the device. If its ``refresh`` is not None, call it before reading its ``positions`` and
+        system: The moments on the device. Call its ``refresh`` before reading its ``positions`` and
             ``moments``: a distant body may have acted by fewer moments, in another system. Probes and
             :meth:`sum_moments` call it themselves.
         shapes: Indices of the magnetic shapes, in the order of :meth:`shape_moments`, shape [n].
@@ -154,6 +154,7 @@ class Magnetics:
         bodies = distant_bodies(model, worlds.magnets, settings, method=method, has_sources=bool(self._sources.applied))
         if bodies:
             self._distant = DistantMagnets(model, placed, bodies, settings, **options)
+        self._refresh_resting, self.system.refresh = self.system.refresh, self._refresh
         self._sources.bind(self.system)
         self.coils = self._sources.circuits
         self._shape_moments = ShapeMoments(model, worlds)
@@ -217,6 +218,7 @@ class Magnetics:
 
         The reference is the sum over all pairs at 256 random magnets. Waits for the device.
         """
+        self._check_induced()
         return self.system.field_error()
 
     @property
@@ -329,8 +331,13 @@ class Magnetics:
             self.coils.step(float(dt), sharing)
 
     def add_forces(self, state: newton.State) -> None:
-        """Add the forces on the present moments to ``state.body_f``: the second half of :meth:`apply`."""
+        """Add the forces on the present moments to ``state.body_f``: the second half of :meth:`apply`.
+
+        Raises:
+            InputError: There is no solve yet, or ``state`` does not fit the model.
+        """
         self._check_state(state, "body_q", "body_f")
+        self._check_induced()
         if self._distant is not None:
             self._distant.add_forces(state)
             return
@@ -522,9 +529,19 @@ class Magnetics:
 
     def _check_solved(self) -> None:
         """Raise :class:`InputError` before the first solve, warn if the last one did not converge."""
+        self._check_induced()
+        self._warn_unconverged()
+
+    def _check_induced(self) -> None:
+        """Raise :class:`InputError` before the first solve; does not wait for the device."""
         if not self._induced:
             raise InputError("Magnetics: there is no field yet, call apply(state) or induce(state) first")
-        self._warn_unconverged()
+
+    def _refresh(self) -> None:
+        """Check that there was a solve, and write the moments of worlds that rest; probes call it, too."""
+        self._check_induced()
+        if self._refresh_resting is not None:
+            self._refresh_resting()
 
     def _warn_unconverged(self) -> None:
         """Warn if the last solve did not converge; waits for the device."""
@@ -556,9 +573,13 @@ class Magnetics:
 
     def sum_moments(self) -> wp.array:
         """Return :meth:`shape_moments` as a Warp array, which the next call overwrites; capturable in a graph."""
-        if self.system.refresh is not None:
-            self.system.refresh()
+        self._refresh()
         return self._shape_moments.sum(self.system.moments)
+
+    @property
+    def summed_moments(self) -> wp.array:
+        """The array that :meth:`sum_moments` writes [A·m²], on the device, shape [n]; zeros before the first call."""
+        return self._shape_moments.totals
 
     def moments_at(self, state: newton.State) -> np.ndarray:
         """Return the total equilibrium moments at a state; present fields and later steps are not affected.

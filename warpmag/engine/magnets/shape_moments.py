@@ -36,12 +36,12 @@ class ShapeMoments:
         ends = self._first[: len(counts) + 1]
         self.volumes = repeat_rows(np.diff(np.concatenate([[0.0], np.cumsum(volumes)])[ends]), copies)
         self._first_on_device = _on_device(self._first, model)
-        self._totals = wp.zeros(len(self.shapes), dtype=wp.vec3, device=model.device)
+        self.totals = wp.zeros(len(self.shapes), dtype=wp.vec3, device=model.device)
 
     def sum(self, moments: wp.array) -> wp.array:
         """Launch the sums of ``moments`` [A·m²], shape [moments]; return an array that the next call overwrites."""
-        sum_moments(self._first_on_device, moments, self._totals)
-        return self._totals
+        sum_moments(self._first_on_device, moments, self.totals)
+        return self.totals
 
     def spread(self, magnetizations: dict[int, np.ndarray], inducible: np.ndarray) -> np.ndarray:
         """Return the magnetization of each moment [A/m], shape [moments, 3], from those of shapes.

@@ -57,7 +57,7 @@ class Recorder:
         state = stepper.state
         coils = magnetics.coils
         self._host_copies = _HostCopies(
-            (state.body_q, state.body_qd, magnetics.sum_moments(), *([] if coils is None else [coils.currents]))
+            (state.body_q, state.body_qd, magnetics.summed_moments, *([] if coils is None else [coils.currents]))
         )
         row_of_coil = {shape: row for row, shape in enumerate([] if coils is None else coils.shapes)}
         self._coils = [row_of_coil[shape] for shape in scene.circuits.values()]

@@ -161,7 +161,7 @@ class Simulation:
             return scene, MagneticSettings(), None
         from warpmag.engine.stepping.scene import import_scene  # noqa: PLC0415 - a builder can do without USD
 
-        if not isinstance(scene, str | os.PathLike):
+        if not isinstance(scene, str | os.PathLike) or not os.fspath(scene):
             raise InputError(f"scene: must be a file or a newton.ModelBuilder, got {short_repr(scene)}")
         self._scene = import_scene(scene, **choices)
         clock = self._scene.clock
@@ -426,7 +426,8 @@ class Simulation:
     def finish(self) -> Statistics:
         """Return the statistics, with the values of the final state; waits for the device."""
         statistics = self.statistics
-        statistics.field_error = self._magnetics.field_error()
+        if self._magnetics.is_solved:
+            statistics.field_error = self._magnetics.field_error()
         statistics.final_overlap, depth, _ = self._stepper.measure_contacts(_OVERLAP)
         statistics.overlap = max(statistics.overlap, statistics.final_overlap)
         statistics.depth = max(statistics.depth, depth)
