@@ -8,8 +8,11 @@ import sys
 import pytest
 from pxr import Usd, UsdGeom
 
+import warpmag
 from tests.recorded_balls import BALL, PATHS, SCENE, add, assert_has, make_frames, open_scene
 from warpmag.errors import InputError
+from warpmag.scenes_usd import balls_up
+from warpmag.show.blender import BLENDER, render_final
 from warpmag.usd import CacheWriter, open_stage
 
 
@@ -170,6 +173,45 @@ def test_impossible_names_are_refused_in_one_line(tmp_path, stage, name):
         message = str(refused.value)
         assert message.isprintable() and "usda" in message
     assert os.listdir(tmp_path) == ["scene.usda"]
+
+
+OF_PATHS = {
+    "check: path": lambda path, _: warpmag.check(path),
+    "open_stage: path": lambda path, _: open_stage(path),
+    "Simulation: scene": lambda path, _: warpmag.Simulation(path, device="cpu"),
+    "Simulation.run: output": lambda path, scene: warpmag.Simulation(scene, device="cpu").run(1, output=path),
+    "render: stage": lambda path, scene: warpmag.render(path, scene.with_name("a.png"), device="cpu"),
+    "render: output": lambda path, scene: warpmag.render(scene, path, device="cpu"),
+    "render_final: stage": lambda path, scene: render_final(path, scene.with_name("a.png")),
+    "render_final: output": lambda path, scene: render_final(scene, path),
+    "export: stage": lambda path, scene: warpmag.export(path, scene.with_name("a.usdc")),
+    "export: output": lambda path, scene: warpmag.export(scene, path),
+    "MagnetizationCurve.from_csv: path": lambda path, _: warpmag.MagnetizationCurve.from_csv(path),
+}
+"""Every public function of a path, with the name of that argument."""
+
+
+@pytest.mark.parametrize("wrong", [3, b"scene.usda", ["scene.usda"], ""])
+@pytest.mark.parametrize("name", OF_PATHS)
+def test_an_argument_that_is_no_path_is_named(name, wrong, tmp_path):
+    balls_up.author(tmp_path / "scene.usda", columns=1, rows=1, layers=1)
+    with pytest.raises(InputError, match=rf"^{name.partition(': ')[2]}: must be [^\n]*$"):
+        OF_PATHS[name](wrong, tmp_path / "scene.usda")
+    assert os.listdir(tmp_path) == ["scene.usda"]
+
+
+@pytest.mark.parametrize("wrong", ["a\0b.usda", "none.usda", "folder", "pipe.usda", "/dev/zero"])
+@pytest.mark.parametrize("name", [name for name in OF_PATHS if "output" not in name])
+def test_no_file_is_one_line(name, wrong, tmp_path, monkeypatch):
+    """Missing, or something else than a file; nothing waits, and nothing is written."""
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe.usda")
+    monkeypatch.setenv(BLENDER, sys.executable)
+    with pytest.raises(InputError) as refused:
+        OF_PATHS[name](wrong if wrong[0] == "/" else tmp_path / wrong, tmp_path / "scene.usda")
+    message = str(refused.value)
+    assert message.isprintable() and wrong.rpartition("/")[2].rpartition("\0")[2] in message
+    assert sorted(os.listdir(tmp_path)) == ["folder", "pipe.usda"]
 
 
 def test_home_and_links_to_folders(tmp_path, monkeypatch):

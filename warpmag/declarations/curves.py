@@ -109,7 +109,7 @@ class MagnetizationCurve:
         Raises:
             InputError: The file cannot be read, or the points are not a magnetization curve.
         """
-        if not isinstance(path, str | os.PathLike):
+        if not isinstance(path, str | os.PathLike) or not os.fspath(path):
             raise InputError(f"path: must be the name of a file, got {short_repr(path)}")
         name = os.path.basename(os.fspath(path)) or "path"
         (_, h_unit), (quantity, second_unit), rows = _read_csv(path, name)

@@ -45,7 +45,8 @@ def render_final(
     Raises:
         InputError: Blender is missing or fails, or the stage cannot be read or has no such frame.
     """
-    path, size = usable_path(output), whole_pair("size", size)
+    usable_path(stage, "stage")
+    path, size = usable_path(output, "output"), whole_pair("size", size)
     if path.suffix not in _PICTURES:
         raise InputError(f"{path}: a finished picture must end in {' or '.join(_PICTURES)}")
     for name, value in zip(("width", "height", "samples"), (*size, samples), strict=True):

@@ -60,7 +60,8 @@ def export(
         >>> warpmag.export("run.usda", "run_for_blender.usdc", fps=24)
         []
     """
-    suffix = usable_path(output).suffix
+    usable_path(stage, "stage")
+    suffix = usable_path(output, "output").suffix
     check_positive("fps", fps)
     if not (isinstance(field_lines, int) and field_lines >= 0):
         raise InputError(f"field_lines: must be a whole number from 0 on, got {short_repr(field_lines)}")

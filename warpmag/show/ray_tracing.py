@@ -102,7 +102,8 @@ def render(
         >>> warpmag.render("lift.usda", "lift.png", size=(64, 36), device="cpu")
         [PosixPath('lift.png')]
     """
-    output, size = usable_path(output), whole_pair("size", size)
+    usable_path(stage, "stage")
+    output, size = usable_path(output, "output"), whole_pair("size", size)
     films.check_name(output)
     if min(size) < 1 or max(size) > 2**14:
         raise InputError(f"size: must be 1 to 16384, got {size[0]} x {size[1]}")

@@ -12,13 +12,14 @@ _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """Control characters, line separators, and the surrogates by which Python represents invalid UTF-8."""
 
 
-def usable_path(path: str | os.PathLike) -> Path:
-    """Return a path, ``~`` expanded; raise :class:`InputError` if USD cannot name it in a layer or in a message."""
-    if not isinstance(path, str | os.PathLike):
-        raise InputError(f"path: must be the name of a file, got {short_repr(path)}")
-    text = os.fsdecode(path)
+def usable_path(path: str | os.PathLike, argument: str = "path") -> Path:
+    """Return a path, ``~`` expanded; raise :class:`InputError` if USD cannot name it in a layer or in a message.
+
+    ``argument`` is the name of the caller's argument, for the message.
+    """
+    text = os.fsdecode(path) if isinstance(path, str | os.PathLike) else ""
     if not text:
-        raise InputError("the path of a file must not be empty")
+        raise InputError(f"{argument}: must be the name of a file, got {short_repr(path)}")
     if _UNPRINTABLE.search(text):
         raise InputError(f"{text!a}: the path contains a control character or is not UTF-8")
     if _ARGUMENTS in text:

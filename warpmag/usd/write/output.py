@@ -43,7 +43,7 @@ class Output:
         ``path`` is the file of the root layer, ``scene`` the resolved paths of the scene's files, which must not be
         overwritten.
         """
-        self.root = usable_path(path)
+        self.root = usable_path(path, "output")
         if self.root.suffix not in _SUFFIXES:
             raise InputError(f"{self.root}: the output must end in {', '.join(_SUFFIXES)}")
         self.cache = self.beside(".cache.usdc")  # the layer with the motion
