@@ -34,11 +34,11 @@ def plain_value(name: str, value: Any) -> Any:
 
     A tensor that NumPy cannot read, on a GPU or with gradients, raises :class:`InputError`.
     """
-    if callable(convert := getattr(value, "numpy", None)):
-        try:
+    try:
+        if callable(convert := getattr(value, "numpy", None)):
             return convert()
-        except Exception as error:  # libraries raise errors of several types
-            raise InputError(f"{name}: cannot be read as a NumPy array ({error})") from error
+    except Exception as error:  # libraries raise errors of several types, those of USD at each access
+        raise InputError(f"{name}: cannot be read as a NumPy array ({error})") from error
     number = getattr(value, "value", None)  # of a Warp scalar
     return number if isinstance(number, numbers.Real) else value
 
