@@ -234,3 +234,9 @@ def test_attributes_of_the_other_kind_are_checked(values):
 def test_points_of_a_coil_that_are_none(shape, points):
     with pytest.raises(InputError, match="^coil: points: must be vectors, got "):
         Coil(**shape, points=points).check("coil")
+
+
+@pytest.mark.parametrize("values", [[[1.0], [2.0, 3.0]], [], None, np.zeros((2, 2, 2)), [[[["x"] * 3] * 2] * 2] * 2])
+def test_values_of_a_map_that_are_none(values):
+    with pytest.raises(InputError, match=r"^map: values: [^\n]*$"):
+        FieldMap((0.0,) * 3, (0.01,) * 3, values).check("map")

@@ -300,7 +300,10 @@ class FieldMap:
     def check(self, name: str) -> None:
         """Raise :class:`InputError` naming ``name`` (a prim path or a function) if a value is out of range."""
         check_fields(self, name, "factor", "origin", "spacing")
-        shape = np.shape(self.values)
+        try:
+            shape = np.shape(self.values)
+        except ValueError:  # a ragged list
+            raise InputError(f"{name}: values: must be an array, got {short_repr(self.values)}") from None
         if len(shape) != 4 or shape[3] != 3 or min(shape) < 2:
             raise InputError(f"{name}: values: shape must be [nx, ny, nz, 3] of 2 or more each, got {list(shape)}")
         corner = np.abs(np.add(self.origin, np.multiply(self.spacing, np.subtract(shape[:3], 1))))
