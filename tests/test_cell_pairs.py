@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 import warpmag
 from bench.reference import boxes, oracle
 from bench.systems import moment_system
+from warpmag.kernels.cells import cell_pairs
 from warpmag.kernels.cells.cell_pairs import CLOSE, WINDOW
 from warpmag.shapes import demagnetization, lattice
 from warpmag.shapes.linear_cells import LEAST_CELLS, with_slopes
@@ -161,6 +162,56 @@ def test_searches_of_earlier_poses_leave_no_trace(device):
         again = values(0.0)
         largest = np.abs(first).max(axis=0)
         assert np.all(np.abs(again - first) <= 1e-12 * largest)  # sums in another order
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_cells_with_too_many_close_ones_act_as_uniform_boxes(dtype, device, monkeypatch):
+    """Fields between bodies are symmetric and forces balanced where details of some cells have no room."""
+    monkeypatch.setattr(cell_pairs, "_LONGEST_CLOSE", 24)
+    turn = Rotation.from_rotvec([0.1, 0.05, 0.3])
+    poses = [
+        (Rotation.identity(), np.zeros(3)),
+        (turn, np.array([0.002, 0.001, 0.0205])),
+        (turn, np.array([0.013] * 3)),
+    ]
+    system, _ = make_pair([FINE, FINE, CUBE], poses, dtype=dtype, device=device)
+    rng = np.random.default_rng(2)
+
+    def moments_and_field():
+        moments = rng.normal(size=(system.count, 3)) * 1e-3 * FAINT
+        system.start_from(wp.array(moments, dtype=system.moments.dtype, device=device))
+        system.begin()
+        system.evaluate()
+        return system.moments.numpy().astype(float), system.h.numpy().astype(float) - np.array([0.0, 0.0, 1e3])
+
+    (one, of_one), (other, of_other) = moments_and_field(), moments_and_field()
+    assert system.crowded.numpy()[0] == 1
+    error = abs((one * of_other).sum() - (other * of_one).sum()) / np.abs(one * of_other).sum()
+    assert error < {"float32": 1e-6, "float64": 1e-14}[dtype]  # sums of 300 terms
+    system.apply_forces()
+    forces = system.forces.numpy().astype(float)
+    assert np.linalg.norm(forces.sum(axis=0)) < {"float32": 1e-5, "float64": 1e-13}[dtype] * np.abs(forces).sum()
+
+
+def test_a_coarse_body_in_a_fine_one_has_room_for_its_near_cells(device):
+    """Lists are long enough for cells of several sizes. With the mean size of cells, some would act as balls."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    warpmag.register_custom_attributes(builder)
+    turn = wp.quat(*Rotation.from_euler("xz", [42.0, -51.0], degrees=True).as_quat())
+    for half, place, spacing in (
+        ((0.03, 0.03, 0.01), wp.transform(), {}),
+        ((0.03, 0.03, 0.00005), wp.transform(), {}),
+        ((0.03, 0.03, 0.01), wp.transform((0.0025, 0.005, 0.0), turn), {"moment_spacing": 0.02}),
+    ):
+        body = builder.add_body(xform=place)
+        builder.add_shape_box(body, hx=half[0], hy=half[1], hz=half[2])
+        warpmag.add_inducible(builder, body=body, material="iron", **spacing)
+    magnetics = warpmag.Magnetics(builder.finalize(device=device), external_field=(1e4, 3e3, 8e3))
+    magnetics.induce(magnetics.model.state())
+    pairs = magnetics.system._cells.pairs.arrays
+    assert pairs.candidate_count.numpy().max() <= pairs.candidate.shape[1]
+    assert magnetics.converged.numpy()[0] == 1
+    assert magnetics.evaluations.numpy()[0] < 300  # 1,000 if the cells of the coarse body act as balls
 
 
 def test_shares_of_boxes_in_each_other():

@@ -128,7 +128,7 @@ template <class Gradients> CUDA_CALLABLE inline void differentiate_row(const Gra
     for (int slot = share(); slot < rows.slots; slot += SHARES) {
         const Cells other = rows.candidates(slot);
         const CellPair pair = {box, rows.boxes(other), rows.listed(other), precedes(rows.own, other),
-                               rows.differ(slot)};
+                               rows.differ(slot, other)};
         const CellMoments other_m = moments_of(g.moments, other);
         if (pass == OF_FIELD) add_field_gradient(pair, m, eta, other_m, moments_of(g.cotangents, other), sums);
         else

@@ -158,8 +158,8 @@ CUDA_CALLABLE inline void tabulate_slot(const Rows<Pairs>& rows, int slot, Point
     const MovedMatrices result = {points, factor, moved, active, OtherSlots(a, found, other, moved)};
     result.write(slot_at(a.matrix.data, rows.capacity, MATRIX_ROWS, slot, rows.row), matrices.means, a.matrix.data,
                  rows.capacity, MATRIX_ROWS, 0);
-    const Mask differ = moved & rows.differ(slot);
-    if (slot < a.close_capacity && any(differ)) {
+    const Mask differ = moved & rows.differ(slot, other);
+    if (any(differ)) {
         const MovedMatrices details = {points, factor, differ, active, OtherSlots(a, found, other, differ)};
         Real* const detail = slot_at(a.detail.data, a.close_capacity, DETAIL_ROWS, slot, rows.row);
         auto write = [&](int first, const Number* values, int other_first) {

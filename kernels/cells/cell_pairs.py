@@ -49,7 +49,7 @@ OVERLAP = 0.02, 0.5
 _LONGEST_LIST = 2048
 """Longest list of candidates. A face cell of a cube has 50 to 60, one in a stack of five sheets up to 500."""
 _LONGEST_CLOSE = 192
-"""Largest number of close candidates of a cell."""
+"""Largest number of close candidates of a cell whose differences act on other bodies."""
 _BALL_REACH = 2.1
 """Half side of the box that stands for a ball in the windows, in longest half sides of the cells of its world: nearer
 than 2.7 to 3.5 sides the field of a ball differs between the halves of a cell."""
@@ -100,7 +100,7 @@ def cell_pairs_type(dtype):
         difference_field: wp.array[vec3]  # half differences of the fields of halves, added to, frames of grids, [n]
         forces: wp.array[vec3]  # [N], shape [n]
         torques: wp.array[vec3]  # about the moments' positions [N·m], shape [n]
-        crowded: wp.array[int]  # 1 if a cell had more candidates than its list holds, shape [1]
+        crowded: wp.array[int]  # 1 if a cell had more candidates, or close ones, than its lists hold, shape [1]
         close_capacity: int  # close candidates of a cell with details; 0 if no body has linear cells
         # Work:
         box: wp.array[dtype]  # line of each moment, as in ``locate``, shape [16 n]
@@ -174,22 +174,22 @@ def _balls_among_cells(balls, radii, worlds, group, half) -> np.ndarray:
 
 
 def _list_length(bodies, group, balls, reach: float) -> int:
-    """Return the length of lists for candidates up to ``reach`` [m]: all bodies of a world around a cell, or a solid.
+    """Return the length of lists for candidates up to ``reach`` [m] of bodies that do not intersect.
 
-    ``balls`` are the indices of balls. Bodies that intersect can have more candidates.
+    At most all bodies of a world are around a cell, or a solid of those with the smallest cells. ``balls`` are the
+    indices of balls. Bodies that intersect can have more candidates.
     """
     near = {id(coupling): _most_near(coupling.positions, reach) for _, coupling in bodies}
-    counts = np.zeros(group.max() + 1)
-    np.add.at(counts, [group[first] for first, _ in bodies], [near[id(coupling)] for _, coupling in bodies])
-    np.add.at(counts, group[balls], 1.0)
-    solid = _MOST_BALLS * (len(balls) > 0) + (
-        4.0
-        / 3.0
-        * np.pi
-        * reach**3
-        / np.mean([np.prod(2.0 * coupling.half_sides, axis=1).max() for _, coupling in bodies])
-    )
-    needed = np.clip(min(counts.max(), solid), _SHORTEST_LIST, _LONGEST_LIST)
+    volumes = np.array([np.prod(2.0 * coupling.half_sides, axis=1).max() for _, coupling in bodies])
+    worlds, most = group[[first for first, _ in bodies]], np.array([near[id(coupling)] for _, coupling in bodies])
+    order = np.lexsort((volumes, worlds))
+    volumes, worlds, most = volumes[order], worlds[order], most[order]
+    before = np.cumsum(most * volumes) - most * volumes
+    before -= before[np.searchsorted(worlds, worlds)]  # volume of the smaller cells of the same world
+    room = 4.0 / 3.0 * np.pi * reach**3 - before
+    counts = np.bincount(worlds, np.clip(room / volumes, 0.0, most), minlength=group.max() + 1)
+    counts += np.minimum(np.bincount(group[balls], minlength=len(counts)), _MOST_BALLS)
+    needed = np.clip(counts.max(), _SHORTEST_LIST, _LONGEST_LIST)
     return 2 ** math.ceil(math.log2(needed))  # the search is compiled for each length
 
 
@@ -228,7 +228,8 @@ class CellPairs:
 
     Attributes:
         arrays: The struct of arrays (:func:`cell_pairs_type`).
-        crowded: 1 if a cell had more candidates than a list holds and took no part, Warp array, shape [1].
+        crowded: 1 if a cell had more candidates than a list holds and took no part, or more close ones than have
+            details, so that its differences did not act on other bodies, Warp array, shape [1].
     """
 
     def __init__(self, bodies, takes_part, cells, layout, rotatable, packed, h, forces, torques):

@@ -196,10 +196,15 @@ template <class Pairs> struct Rows {
         for (int l = 0; l < WIDTH; ++l) numbers[l] = counts[l] == 0 ? 0 : end_of_kinds(a, own.at[l], first_kinds);
         return largest_count(numbers);
     }
-    // Where differences act with the candidate of a slot.
-    CUDA_CALLABLE Mask differ(int slot) const {
+    // Where differences act with the candidate of a slot: between close cells with room for the details of all their
+    // close candidates.
+    CUDA_CALLABLE Mask differ(int slot, const Cells& other) const {
         Cells close;
-        for (int l = 0; l < WIDTH; ++l) close.at[l] = end_of_kinds(a, own.at[l], CLOSE_KINDS);
+        for (int l = 0; l < WIDTH; ++l) {
+            const int own_close = end_of_kinds(a, own.at[l], CLOSE_KINDS),
+                      other_close = end_of_kinds(a, other.at[l], CLOSE_KINDS);
+            close.at[l] = own_close <= a.close_capacity && other_close <= a.close_capacity ? own_close : 0;
+        }
         return mask_of(indices(close.at) > slot);
     }
     // Candidates of a slot; where there is none, or it takes no part, the own cell.
@@ -242,7 +247,7 @@ template <class Pairs> struct Rows {
     // The pairs of a slot; where they are not ``active`` their windows are 0.
     CUDA_CALLABLE BoxPair pair(const Boxes& box, int slot, const Cells& other, const Boxes& other_box,
                                const RelativePose& pose, Mask active) const {
-        return box_pair(box, other_box, pose, active, precedes(own, other), differ(slot));
+        return box_pair(box, other_box, pose, active, precedes(own, other), differ(slot, other));
     }
 };
 }

@@ -76,8 +76,8 @@ class MomentSystem:
         positions: Moment positions [m], shape [n]; written by the caller before :meth:`solve`.
         moments: Moments [A·m²], shape [n]. The caller writes permanent moments, :meth:`solve` inducible moments.
         external_field: Applied field [A/m], shape [n]; the caller may change it.
-        crowded: 1 if some cells have too many neighbors in other bodies, so that they act as balls, shape [1]; None
-            unless a world has several bodies of ``couplings``.
+        crowded: 1 if some cells have too many near cells in other bodies: they act as balls, or as uniform boxes,
+            shape [1]; None unless a world has several bodies of ``couplings``.
         resting: 1 for worlds that :meth:`solve` leaves out, with their moments as they are, shape [worlds]; only the
             dynamics ``theta`` has them. The caller may write it.
         refresh: Function that launches the update of ``positions`` and ``moments`` in worlds that rest, where other

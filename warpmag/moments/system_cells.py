@@ -58,7 +58,7 @@ class SystemCells:
 
     @property
     def crowded(self) -> wp.array | None:
-        """1 if some cells have too many neighbors in other bodies, so that they act as balls, shape [1]."""
+        """1 if some cells have too many near cells: they act as balls, or as uniform boxes, shape [1]."""
         return None if self.pairs is None else self.pairs.crowded
 
     def average_sources(self, sources: AppliedForces):
