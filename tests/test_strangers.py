@@ -15,6 +15,7 @@ from warpmag.engine.stepping.scene import import_scene
 from warpmag.errors import InputError
 from warpmag.scenes_usd import balls_up
 from warpmag.usd import check
+from warpmag.usd.read.trial_read import irregular_file
 
 PICTURES = pytest.importorskip("PIL.Image")
 
@@ -215,6 +216,16 @@ def test_no_layer_is_read_from_a_device(place, kind, tmp_path):
         os.close(writer)
     assert result.returncode == 2 and "is not a regular file" in result.stderr, result.stderr
     assert result.stderr.count("\n") == 1 and time.monotonic() - began < 30.0
+
+
+def test_a_path_behind_links_that_cannot_be_read_is_no_file(monkeypatch):
+    """As ``/proc/1/root/scene.usda`` is to all users but root."""
+
+    def realpath(path):
+        raise PermissionError(13, "Permission denied", path)
+
+    monkeypatch.setattr(os.path, "realpath", realpath)
+    assert "is not a regular file" in irregular_file("scene.usda")
 
 
 @pytest.mark.parametrize("kind", IRREGULAR)

@@ -269,9 +269,7 @@ class Simulation:
         if error > rtol:
             lines.append(f"fields by multipoles have an error of {error:.2g} > rtol {rtol:g}; use method direct")
         if (crowded := self._magnetics.system.crowded) is not None and crowded.numpy()[0]:
-            lines.append(
-                "some cells of inducible bodies near too many others acted as balls or uniform boxes"
-            )
+            lines.append("some cells of inducible bodies near too many others acted as balls or uniform boxes")
         return lines
 
     @property

@@ -98,9 +98,11 @@ def _trial(path: str | os.PathLike) -> list[str]:
 
 def irregular_file(path: str | os.PathLike) -> str:
     """Return the reason not to open a path: it is a device, a pipe or a file of the system. Empty otherwise."""
-    real = os.path.realpath(path)
     try:
+        real = os.path.realpath(path)
         mode = os.stat(real).st_mode
+    except PermissionError:  # links of /proc to other processes
+        return f"{path} is not a regular file, or its links cannot be read"
     except OSError:  # USD reports missing files
         return ""
     regular = (stat.S_ISREG(mode) or stat.S_ISDIR(mode)) and not real.startswith(_SYSTEM_FOLDERS)
