@@ -184,9 +184,9 @@ def test_cells_with_too_many_close_ones_act_as_uniform_boxes(dtype, device, monk
         system.evaluate()
         return system.moments.numpy().astype(float), system.h.numpy().astype(float) - np.array([0.0, 0.0, 1e3])
 
-    (one, of_one), (other, of_other) = moments_and_field(), moments_and_field()
+    (first, of_first), (other, of_other) = moments_and_field(), moments_and_field()
     assert system.crowded.numpy()[0] == 1
-    error = abs((one * of_other).sum() - (other * of_one).sum()) / np.abs(one * of_other).sum()
+    error = abs((first * of_other).sum() - (other * of_first).sum()) / np.abs(first * of_other).sum()
     assert error < {"float32": 1e-6, "float64": 1e-14}[dtype]  # sums of 300 terms
     system.apply_forces()
     forces = system.forces.numpy().astype(float)

@@ -19,8 +19,8 @@ _OF_FIELD, _OF_WRENCH = range(2)
 """The passes; as in ``cell_pair_gradients.h``."""
 _STEP = 3e-6
 """Largest motion of a pair in a difference, in mean sizes and radians: about the cube root of the precision."""
-_SHARED_ARRAYS = "candidate", "candidate_count", "rows", "cell", "column", "kind_end"
-"""Arrays of whole numbers that are those of the pairs."""
+_SHARED = "candidate", "candidate_count", "rows", "cell", "column", "kind_end", "close_capacity"
+"""Whole numbers and their arrays that are those of the pairs."""
 
 
 @wp.struct
@@ -70,7 +70,7 @@ class CellPairGradients:
         """Allocate the buffers."""
         n, self._device, self._given = pairs.group.shape[0], pairs.h.device, pairs
         self.arrays = g = CellPairGradientArrays()
-        for name in _SHARED_ARRAYS:
+        for name in _SHARED:
             setattr(g.pairs, name, getattr(pairs, name))
         g.pairs.box = wp.zeros(pairs.box.shape, dtype=wp.float64, device=self._device)
 
