@@ -251,6 +251,12 @@ def test_wrong_array(name, wrong, world):
         call(world, array)
 
 
+def test_a_start_beyond_single_precision_is_refused(world):
+    """NumPy would make it infinite."""
+    with pytest.raises(warpmag.InputError, match=r"^magnetizations: shape 0: must be at most 1e\+30 A/m, got "):
+        world.magnetics.start_from({0: (0.0, -2e30, 0.0)})
+
+
 WORLDS = {"of several": [0, 0, 0], "none": [], "fractions": [0.5, 0.5], "negative": [-1, 0], "too many": [0, 1]}
 WORLDS |= {"texts": ["a", "b"], "a table": [[0, 0]], "an object": object(), "Warp's": lambda: wp.zeros(7, dtype=int)}
 

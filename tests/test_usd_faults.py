@@ -459,6 +459,12 @@ def test_ends_of_a_prismatic_joint_may_be_apart_along_its_axis(tmp_path, place, 
     assert result == [warning] * (apart > 0)
 
 
+def test_a_moment_of_an_impossible_magnetization(device, tmp_path):
+    path = write(tmp_path, ball("vector3f warpmag:moment = (0, 1e38, 0)"))
+    with pytest.raises(InputError, match=r"^/Ball: magnetization by warpmag:moment: must be at most 1e\+30 A/m, got "):
+        Simulation(path, device=device)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "told"),
     [

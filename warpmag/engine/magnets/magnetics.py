@@ -613,7 +613,7 @@ class Magnetics:
                 keep their own. The other shapes start from zero.
 
         Raises:
-            InputError: A shape has no magnet, or a magnetization is not three finite numbers.
+            InputError: A shape has no magnet, or a magnetization is not three numbers of at most 1e30.
         """
         inducible = ~self._placed.table.permanent.numpy()
         start = self._shape_moments.spread(magnetizations, inducible)

@@ -6,7 +6,8 @@ import newton
 import numpy as np
 import warp as wp
 
-from warpmag.declarations.checks import check_vector, check_whole, short_repr
+from warpmag.declarations.checks import check_whole, short_repr, vector
+from warpmag.declarations.coils import STRONGEST_FIELD
 from warpmag.engine.magnets.equal_worlds import EqualWorlds
 from warpmag.engine.magnets.grouping import BodyMagnet
 from warpmag.errors import InputError
@@ -49,7 +50,7 @@ class ShapeMoments:
         Shapes with moments that are not ``inducible``, shape [moments], and shapes without a magnetization get zeros.
 
         Raises:
-            InputError: A shape has no magnet, or a magnetization is not three finite numbers.
+            InputError: A shape has no magnet, or a magnetization is not three numbers of at most 1e30.
         """
         if not isinstance(magnetizations, dict):
             raise InputError(f"magnetizations: must be a dictionary by shape, got {short_repr(magnetizations)}")
@@ -57,13 +58,19 @@ class ShapeMoments:
         for shape, magnetization in magnetizations.items():
             if shape not in own_shapes:
                 raise InputError(f"magnetizations: shape {short_repr(shape)} has no magnet")
-            check_vector(f"magnetizations: shape {shape}", magnetization)
+            check_start(f"magnetizations: shape {shape}", magnetization)
         spread = np.zeros((len(inducible), 3))
         for part, shape in enumerate(own_shapes):
             rows = slice(self._first[part], self._first[part + 1])
             if shape in magnetizations and inducible[rows].all():
                 spread[rows] = magnetizations[shape]
         return spread
+
+
+def check_start(name: str, magnetization) -> None:
+    """Raise :class:`InputError` unless a solve can start from a magnetization [A/m]: three numbers of at most 1e30."""
+    if max(map(abs, vector(name, magnetization))) > STRONGEST_FIELD:
+        raise InputError(f"{name}: must be at most {STRONGEST_FIELD:g} A/m, got {short_repr(magnetization)}")
 
 
 class PermanentShapes:

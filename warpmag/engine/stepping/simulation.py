@@ -15,6 +15,7 @@ from warpmag.declarations.magnets import MagneticSettings
 from warpmag.deprecation import renamed_arguments
 from warpmag.engine.magnets.caller_checks import check_control
 from warpmag.engine.magnets.magnetics import Magnetics
+from warpmag.engine.magnets.shape_moments import check_start
 from warpmag.engine.magnets.workload import moments_line
 from warpmag.engine.pile_xpbd.contacts import RigidSolver, body_sizes
 from warpmag.engine.pile_xpbd.solvers import SOLVERS, check_solver
@@ -208,7 +209,9 @@ class Simulation:
         volumes = dict(zip(self._magnetics.shapes.tolist(), self._magnetics.shape_volumes.tolist(), strict=True))
         for prim, moment in self._scene.magnets.initial_moments.items():
             shapes = self._scene.magnet_shapes[prim]
-            magnetizations |= dict.fromkeys(shapes, np.array(moment) / sum(volumes[shape] for shape in shapes))
+            magnetization = np.array(moment) / sum(volumes[shape] for shape in shapes)
+            check_start(f"{prim}: magnetization by warpmag:moment", magnetization.tolist())
+            magnetizations |= dict.fromkeys(shapes, magnetization)
         if magnetizations:
             self._magnetics.start_from(magnetizations)
 
