@@ -1,11 +1,12 @@
 // Tensor and forces of a pair of magnetized boxes, less those of balls of the same volumes, in the frame of box i.
 //
-// The tensor of close boxes is the field of the larger box, averaged over 2³ Gauss points of the smaller one. Beside a
-// flat box the field varies more over its faces, so 4 × 4 × 2 points replace them there. One of a pair may be a ball: a
-// ball's field is a closed form, too, and the average over a ball is the value at its center. Boxes farther apart
-// differ from balls by their quadrupoles. A window function ends this difference. Forces are the exact derivatives of
-// the energy −μ0 m_i·T_ij·m_j, so that they conserve energy and momentum. Lengths are in units of the mean of the
-// boxes' sizes.
+// The tensor of close boxes is the field of the longer box, averaged over 2³ Gauss points of the shorter one, whose
+// points are closer together: with the points of a sheet of long cells on one of shorter, thicker cells the operator
+// of induction would have negative eigenvalues. Beside a flat box the field varies more over its faces, so 4 × 4 × 2
+// points replace them there. One of a pair may be a ball: a ball's field is a closed form, too, and the average over a
+// ball is the value at its center. Boxes farther apart differ from balls by their quadrupoles. A window function ends
+// this difference. Forces are the exact derivatives of the energy −μ0 m_i·T_ij·m_j, so that they conserve energy and
+// momentum. Lengths are in units of the mean of the boxes' sizes.
 //
 // From Python: WINDOW_BEGIN, WINDOW_END, CLOSE_BEGIN, CLOSE_END, FINE_BEGIN and FINE_END, distances of the windows.
 #pragma once
@@ -16,7 +17,7 @@
 
 namespace warpmag {
 
-constexpr Real SMALLER = Real(0.999); // ratio of volumes from which a box counts as smaller than another one
+constexpr Real SHORTER = Real(0.999); // ratio of longest sides from which a box counts as shorter than another one
 
 // Boxes of cells: center, half sides, rotation to the world as quaternion, volume, the size that scales the window, and
 // the radius of the ball of the same volume. Balls have half sides for the windows only. ``linear`` boxes have
@@ -61,14 +62,20 @@ struct BoxPair {
     Mask own_points, of_ball, at_ball, linear;
 };
 CUDA_CALLABLE inline Number longest(Vector half) { return larger(half.x, larger(half.y, half.z)); }
+// Half the longest side of a box, and half the side of a cube of the volume of a ball.
+CUDA_CALLABLE inline Number longest_of(const Boxes& box) {
+    const Number of_cube = Real(0.8059959770082348) * box.radius, of_box = longest(box.half);
+    return box.ball ? of_cube : of_box;
+}
 CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, const RelativePose& pose, Mask listed,
                                       Mask own_first, Mask differ) {
     const Number unit = 2 / (own.size + other.size);
     const Vector r = unit * pose.r;
     const Number d = length(r);
     Window close = window_between(d, CLOSE_BEGIN, CLOSE_END, listed);
-    const Mask own_smaller = own.volume < SMALLER * other.volume, alike = own.volume * SMALLER <= other.volume;
-    const Mask own_points = own_smaller | (own_first & alike);
+    const Number own_longest = longest_of(own), other_longest = longest_of(other);
+    const Mask own_shorter = own_longest < SHORTER * other_longest, alike = own_longest * SHORTER <= other_longest;
+    const Mask own_points = own_shorter | (own_first & alike);
     const Mask flat = own_points ? own.flat : other.flat;
     return {unit * own.half,
             unit * other.half,
