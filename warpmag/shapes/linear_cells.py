@@ -104,7 +104,7 @@ class _Operator:
         offsets, inverse = np.unique(index[self.row] - index[self.other], axis=0, return_inverse=True)
         shares = (scale / part.sides.prod())[:, None, None]
         self._differences = [-block[inverse.reshape(-1)] * shares for block in half_cell_tensors(offsets, part.sides)]
-        self._differences[2][own] += _WITHIN_HALF * np.eye(3)
+        self._differences[2][own] += np.diag(_within_half(index, part.sides))
         self._slopes = [self._difference(axis) for axis in range(3)]
         self._curls = [self._curl(axis, part.sides) for axis in range(3)]
 
@@ -163,6 +163,13 @@ class _Operator:
             values = 0.5 * factor * np.array(signs)[:, None] * least / self._root[cells]
             result[component] = csr_array((values.ravel(), (rows, cells.ravel())), shape=shape)
         return result
+
+
+def _within_half(index: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    extent = (np.ptp(index, axis=0) + 1) * sides
+    across = np.array([min(extent[(k + 1) % 3], extent[(k + 2) % 3]) for k in range(3)])
+    phase = 4.0 * np.pi * across / sides
+    return _WITHIN_HALF * (1.0 - np.tanh(phase / 2.0) / (phase / 2.0))
 
 
 def half_cell_tensors(offsets: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
