@@ -90,6 +90,12 @@ class Coupling:
         """Largest distance of a moment from the center [m], or the radius of a single moment."""
         return float(np.linalg.norm(self.positions - self.center, axis=1).max()) or float(self.radii.max())
 
+    @cached_property
+    def is_sheet(self) -> bool:
+        """True for linear cells in one or two layers."""
+        local = self.positions @ rotate(self.grid_rotation[None], np.eye(3)).T
+        return self.slopes is not None and bool((np.ptp(local, axis=0) < 1.5 * self.cell_sides).any())
+
     def among(self, bodies: int) -> "Coupling":
         """Return the coupling in a world with a number of bodies of cells, itself included; one for all of a shape.
 

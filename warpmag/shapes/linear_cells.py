@@ -15,8 +15,15 @@ reduce the slopes of cells that differ in volume from their neighbors or from V_
 the operator is not positive. The field that magnetizes a cell is the derivative of the energy: the mean field, plus Dᵀ
 of half the difference of the fields of the halves.
 
-The halves are uniform, but the magnetization they represent is linear. The difference of the two is a sawtooth, whose
-field is H = −M as in a plate. Its energy per volume, μ0 (D M)²/6, remains where div M = 0. So it is subtracted.
+The halves are uniform, but the magnetization they represent is linear. The difference of the two is a sawtooth along
+the axis, of period l/2 for a side l. Deep in a body its field is H = −M as in a plate, and its energy per volume, μ0 (D
+M)²/6, remains where div M = 0. So it is subtracted. In a sheet of thickness t the field is weaker, and weakest between
+two sheets of opposite sawteeth, a stack of which has the demagnetizing factor
+
+    1 − tanh(p/2)/(p/2),    p = 4π t/l,
+
+of a harmonic wave. Only that part is subtracted: with all of it the sawteeth of a sheet would have negative energy, and
+a sheet of 60 × 60 × 0.1 mm on a plate would not converge.
 
 Magnetizations without charges have no energy. In iron they do not occur, because M follows the curl-free field H. But
 conjugate gradients need many steps for them, and errors of distant pairs of cells would make their energy negative. So
@@ -40,7 +47,7 @@ _CURL = 0.004
 """Demagnetizing factor of the curl. It removes 1 % of the force between letters in contact. At a third of it, five
 discs in a stack do not converge."""
 _WITHIN_HALF = 1.0 / 3.0
-"""Demagnetizing factor of the linear part within a half, for the difference D M."""
+"""Demagnetizing factor of the linear part within a half, for the difference D M, deep in a body."""
 
 
 def with_slopes(coupling: Coupling, lattice: Lattice) -> Coupling:
@@ -166,9 +173,13 @@ class _Operator:
 
 
 def _within_half(index: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    """Return the demagnetizing factors of the linear parts within halves along each axis, shape [3].
+
+    ``index`` are the grid indices of a body's cells, shape [n, 3], ``sides`` those of a whole cell, shape [3].
+    """
     extent = (np.ptp(index, axis=0) + 1) * sides
-    across = np.array([min(extent[(k + 1) % 3], extent[(k + 2) % 3]) for k in range(3)])
-    phase = 4.0 * np.pi * across / sides
+    thickness = np.array([min(extent[k - 2], extent[k - 1]) for k in range(3)])
+    phase = 4.0 * np.pi * thickness / sides
     return _WITHIN_HALF * (1.0 - np.tanh(phase / 2.0) / (phase / 2.0))
 
 
