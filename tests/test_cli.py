@@ -13,6 +13,7 @@ from importlib import metadata
 from types import SimpleNamespace
 
 import pytest
+import warp as wp
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
 from warpmag import cli
@@ -62,6 +63,12 @@ def test_too_little_memory_is_one_line(scene, said, monkeypatch, capsys):
     monkeypatch.setattr(cli, "_load", load)
     assert cli.main(["run", str(scene)]) == cli.FAILED
     assert capsys.readouterr().err == f"warpmag: not enough memory{f' ({said})' * bool(said)}\n"
+
+
+def test_too_little_memory_for_warp_is_one_line(scene, device, monkeypatch, capsys):
+    monkeypatch.setattr(cli, "_load", lambda *_, **__: wp.empty((2**30, 2**30), dtype=wp.uint8, device=device))
+    assert cli.main(["run", str(scene)]) == cli.FAILED
+    assert re.fullmatch(r"warpmag: not enough memory \(Failed to allocate 1152.* bytes .*\)\n", capsys.readouterr().err)
 
 
 def test_version(capsys):

@@ -81,7 +81,7 @@ def _execute(arguments: list[str] | None, all_ranks: Ranks | None, stopwatch: St
     except Stopped as stopped:
         return STOPPED + stopped.number, str(stopped)
     except MemoryError as error:
-        return FAILED, one_line(f"not enough memory ({error})" if str(error) else "not enough memory")
+        return FAILED, _no_memory(str(error))
     except BrokenPipeError:
         silence(1)
         return STOPPED + signal.SIGPIPE, "the standard output was closed"
@@ -89,10 +89,16 @@ def _execute(arguments: list[str] | None, all_ranks: Ranks | None, stopwatch: St
         silence(1)
         return FAILED, one_line(str(error))
     except Exception as error:
+        if str(error).startswith("Failed to allocate"):  # Warp's RuntimeError
+            return FAILED, _no_memory(str(error))
         if all_ranks is None:
             raise
         traceback.print_exc()  # return, so that the other ranks end as well
         return FAILED, f"{type(error).__name__}: {error}"
+
+
+def _no_memory(told: str) -> str:
+    return one_line(f"not enough memory ({told})" if told else "not enough memory")
 
 
 def _parser() -> argparse.ArgumentParser:
