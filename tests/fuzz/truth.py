@@ -415,6 +415,7 @@ def _moments(reading, result):
         )
         slow = not spin or spin.GetLength() < FAST
         at_rest = slow and np.abs(after - before).max() < 0.1  # a moment is that of the last substep
+        at_rest &= not _is_beyond_floats(prim, end)
         least = float(np.finfo(np.float32).tiny)  # smaller numbers keep few digits
         apart = at_rest and np.linalg.norm(given @ after - written) > 0.2 * size + least
         if apart or not math.isclose(size, np.linalg.norm(written), rel_tol=1e-3, abs_tol=least):
@@ -439,6 +440,19 @@ def _shares(reading, prim) -> bool:
     others = [other for other in reading.colliders if body and other != prim and reading.above(other) == body]
     ranges = [box.ComputeWorldBound(other).ComputeAlignedRange() for other in others]
     return any(not Gf.Range3d.GetIntersection(own, span).IsEmpty() for span in ranges)
+
+
+def _is_beyond_floats(prim, time) -> bool:
+    """True if a prim or one above is turned by angles whose neighbors in single precision are over 1 degree apart.
+
+    Between two keys the turn of the last substep and that of the frame then have nothing in common.
+    """
+    while prim and not prim.IsPseudoRoot():
+        for operation in UsdGeom.Xformable(prim).GetOrderedXformOps() if prim.IsA(UsdGeom.Xformable) else ():
+            if "rotate" in operation.GetName() and np.abs(np.array(operation.Get(time), float)).max() > 1e7:
+                return True
+        prim = prim.GetParent()
+    return False
 
 
 def _turn(cache, prim) -> np.ndarray:
