@@ -6,6 +6,7 @@ import math
 import newton
 import numpy as np
 import pytest
+import warp as wp
 
 import warpmag
 from bench import iron
@@ -100,6 +101,39 @@ def test_equal_sheets_that_lie_on_each_other_converge(size, direction, device):
     magnetics.induce(magnetics.model.state())
     assert magnetics.converged.numpy().all()
     assert magnetics.evaluations.numpy().max() < 300  # 70 to 120
+
+
+def solved_boxes(sizes, angles, susceptibility, field, device):
+    """Evaluations of boxes on each other, and whether their solve converged; sizes are from the lowest on [m]."""
+    builder, height = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0)), 0.0
+    warpmag.register_custom_attributes(builder)
+    for size, angle in zip(sizes, angles, strict=True):
+        center, turn = (0.0, 0.0, height + 0.5 * size[2]), wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angle)
+        body = builder.add_body(xform=wp.transform(center, turn))
+        builder.add_shape_box(body, hx=0.5 * size[0], hy=0.5 * size[1], hz=0.5 * size[2])
+        warpmag.add_inducible(builder, body=body, susceptibility=susceptibility, saturation=1e9)
+        height += size[2]
+    magnetics = warpmag.Magnetics(builder.finalize(device=device), external_field=field)
+    magnetics.induce(magnetics.model.state())
+    return magnetics.evaluations.numpy().max(), magnetics.converged.numpy().all()
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+@pytest.mark.parametrize("size", [(0.03, 0.03, 0.001), (0.05, 0.02, 0.002)], ids=["one layer", "two layers"])
+def test_stacks_of_sheets_without_saturation_converge(size, count, device):
+    """With the energy of linear parts deep in a body, or without larger sizes, three and five do not converge."""
+    evaluations, converged = solved_boxes([size] * count, [0.0] * count, 5000.0, (1e4, 2e4, 5e3), device)
+    assert converged
+    assert evaluations < 400  # 85 to 220
+
+
+@pytest.mark.parametrize("angle", [0.0, 1.3])
+def test_a_sheet_of_long_thin_cells_on_a_plate_converges(angle, device):
+    """Vortices in the sheet would have negative energy: with points of the sheet, or with all of the linear parts."""
+    sizes = [(0.06, 0.06, 1e-4), (0.02, 0.02, 0.001)]
+    evaluations, converged = solved_boxes(sizes, [0.0, angle], 1e4, (0.0, 2e4, 5e3), device)
+    assert converged
+    assert evaluations < 400  # 170 to 250
 
 
 def test_finite_elements_repeat_the_table():
