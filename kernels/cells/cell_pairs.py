@@ -29,9 +29,10 @@ root of its ratio to the shortest, less for small cells. Dipoles lack the quadru
 distance. With 4.5 and 6 the force between two discs of 40:2 mm has an error of 3 % in place of 5 %, and forces in a
 stack of five 6 to 10 % in place of 7 to 16 %. But then up to five times as many cells are in the lists."""
 _OF_SHEETS = 1.5
-"""Factor of the sizes of linear cells in sheets of one or two layers. The fields of their cells almost cancel, also
-where differences end to act. Without the factor the operator of three sheets of 30 × 30 × 1 mm that lie on each other
-would have an eigenvalue of -0.0014, and stacks of discs would take 1 to 2 % more force."""
+"""Factor of the sizes of linear cells in sheets of one or two layers. The fields of their cells almost cancel, but not
+where the formulas change with the distance. Without the factor the operator of three sheets of 30 × 30 × 1 mm that lie
+on each other would have an eigenvalue of -0.0014, and forces in stacks of discs would be 1 to 2 % larger. With it steps
+with sheets in contact take up to twice as long."""
 _FLATTEST = 3.0
 """Largest ratio of sides that increases a size, that of whole cells at automatic spacing. Flatter cells are parts that
 a surface cuts off, of little volume."""

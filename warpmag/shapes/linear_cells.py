@@ -17,13 +17,14 @@ of half the difference of the fields of the halves.
 
 The halves are uniform, but the magnetization they represent is linear. The difference of the two is a sawtooth along
 the axis, of period l/2 for a side l. Deep in a body its field is H = −M as in a plate, and its energy per volume, μ0 (D
-M)²/6, remains where div M = 0. So it is subtracted. In a sheet of thickness t the field is weaker, and weakest between
-two sheets of opposite sawteeth, a stack of which has the demagnetizing factor
+M)²/6, remains where div M = 0. So it is subtracted. In a sheet of thickness t the field is weaker. It is weakest where
+the next sheets on both sides have the opposite sawtooth. A harmonic wave in a stack of such sheets has the
+demagnetizing factor
 
-    1 − tanh(p/2)/(p/2),    p = 4π t/l,
+    1 − tanh(p/2)/(p/2),    p = 4π t/l.
 
-of a harmonic wave. Only that part is subtracted: with all of it the sawteeth of a sheet would have negative energy, and
-a sheet of 60 × 60 × 0.1 mm on a plate would not converge.
+Only this part of the energy is subtracted. With all of it the energy of a sheet could be negative, and the solve of a
+sheet of 60 × 60 × 0.1 mm on a plate would not converge.
 
 Magnetizations without charges have no energy. In iron they do not occur, because M follows the curl-free field H. But
 conjugate gradients need many steps for them, and errors of distant pairs of cells would make their energy negative. So
