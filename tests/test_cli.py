@@ -415,7 +415,7 @@ def test_check_ends_with_a_verdict(scene, tmp_path, capsys):
 def test_check_counts_moments_and_solves_nothing(scene, capsys, monkeypatch):
     monkeypatch.setattr("warpmag.engine.magnets.magnetics.Magnetics.induce", None)
     assert cli.main(["check", str(scene)]) == 0
-    assert re.search(r"^moments     [\d,]+ of \d+ bodies, at most [\d,]+: /", capsys.readouterr().out, re.M)
+    assert re.search(r"^moments     [\d,]+ in \d+ bodies, at most [\d,]+ in one body: /", capsys.readouterr().out, re.M)
 
 
 class Terminal(io.StringIO):

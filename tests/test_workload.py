@@ -61,4 +61,14 @@ def test_workload_needs_a_solve(device):
 def test_the_number_of_moments_in_words():
     magnetics = warpmag.Magnetics(model_of("cpu", worlds=1))
     count = magnetics.system.count
-    assert moments_line(magnetics) == f"{count} of 3 bodies, at most {count - 9}: plate"
+    assert moments_line(magnetics) == f"{count} in 3 bodies, at most {count - 9} in one body: plate"
+
+
+def test_the_number_of_moments_of_one_body_in_words():
+    builder = newton.ModelBuilder()
+    warpmag.register_custom_attributes(builder)
+    ball = builder.add_body()
+    shape = builder.add_shape_sphere(ball, radius=0.005, label="ball")
+    warpmag.add_inducible(builder, shape=shape)
+    magnetics = warpmag.Magnetics(builder.finalize(device="cpu"))
+    assert moments_line(magnetics) == "1 in 1 body: ball"

@@ -73,7 +73,8 @@ comparable. A run ends early after {TIME_LIMIT:g} s of wall time. The column "en
   magnet of the letters then has {letters["moment"]:g} A·m² in place of 12 A·m². The paper states no strengths. It calls
   its magnets "excessively strong", and argues in section 6.1 that f'(H) falls as M grows, as it does in bodies that
   saturate.
-* Induction is converged at e_M ≤ 1e-3. Several substeps may share one induction, which then counts once.
+* Induction is converged at e_M ≤ 1e-3. Several substeps may share one solve, which the columns "per substep" count
+  once.
 * A body is "held" if it touches a permanent magnet, directly or through other bodies that are not on the ground. Empty
   cells mean that no body is held: nothing collides with the magnet of Alphabets, and some runs of Table 1 end before a
   body touches a magnet.

@@ -114,7 +114,7 @@ def outcome_cells(values: dict) -> dict[str, str]:
     return {
         "substeps per step": f"{values['substeps']:.1f}",
         "field evaluations per substep": f"{values['evaluations_per_substep']:.1f}",
-        "substeps not converged": f"{100.0 * values['unconverged']:.0f} %",
+        "unconverged solves per substep": f"{100.0 * values['unconverged']:.0f} %",
         "held": f"{held} of {values['magnets']}" if held else "",
         "RMS speed of held [cm/s]": f"{100.0 * values['held_rms_speed']:.2f}" if held else "",
         "median speed of held [cm/s]": f"{100.0 * values['held_median_speed']:.2f}" if held else "",

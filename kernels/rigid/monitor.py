@@ -33,8 +33,8 @@ PEAK_ERROR = 6  # magnetization error [1]
 PEAKS = 7
 
 COUNT_BAD_BODY = 0  # first body whose state was not finite, see ``watch``; else NO_BODY
-COUNT_EVALUATIONS = 1  # field evaluations, summed over substeps
-COUNT_UNCONVERGED = 2  # substeps whose induction did not converge
+COUNT_EVALUATIONS = 1  # field evaluations, summed over solves
+COUNT_UNCONVERGED = 2  # induction solves that did not converge
 COUNT_OVERLAPS = 3  # contacts deeper than a threshold
 COUNT_CAPACITIES = 4
 

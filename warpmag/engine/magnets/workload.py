@@ -100,5 +100,6 @@ def moments_line(magnetics) -> str:
     counts = [len(magnet.lattice.volumes) for magnet in magnetics.magnets]
     largest = int(np.argmax(counts))
     label = magnetics.model.shape_label[magnetics.magnets[largest].shapes[0]]
-    bodies = f"{len(counts):,} bod{'ies' if len(counts) > 1 else 'y'}"
-    return f"{sum(counts):,} of {bodies}, at most {counts[largest]:,}: {label}"
+    if len(counts) == 1:
+        return f"{counts[0]:,} in 1 body: {label}"
+    return f"{sum(counts):,} in {len(counts):,} bodies, at most {counts[largest]:,} in one body: {label}"

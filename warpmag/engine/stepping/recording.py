@@ -112,7 +112,7 @@ class Recorder:
         if time > 0.0:
             self._magnetics.sum_moments()
         else:
-            with warnings.catch_warnings():  # the statistics count substeps that did not converge
+            with warnings.catch_warnings():  # the statistics count solves that did not converge
                 warnings.simplefilter("ignore", ConvergenceWarning)
                 self._magnetics.moments_at(state)
         self._host_copies.copy()

@@ -29,7 +29,7 @@ class Statistics:
         repeated: Number of rejected attempts at a step.
         capped: Number of steps where a body moved farther than allowed even in the shortest substep.
         regrown: Number of steps that enlarged contact or pair buffers.
-        unconverged: Number of substeps without convergence of the induction.
+        unconverged: Number of induction solves that did not converge. Short substeps share a solve.
         error: Largest magnetization error of any substep.
         field_error: Relative error of the last field by the fast multipole method at 256 random magnets, compared with
             sums over all pairs; 0 without that method.
@@ -127,7 +127,8 @@ class Statistics:
             spacing = f"{100.0 * self.coarseness:.2g} % of a radius"
             lines.append(f"bodies are far from the origin: positions in single precision are {spacing} apart")
         if self.unconverged:
-            lines.append(f"induction did not converge in {self.unconverged} of {self.substeps} substeps")
+            solves = f"{self.unconverged} induction solve{'s' * (self.unconverged > 1)}"
+            lines.append(f"{solves} did not converge, in {self.substeps} substeps")
         if self.final_overlap > _DEEP:
             lines.append(f"bodies overlap by {100.0 * self.final_overlap:.0f} % of their radius at the end")
         if self.capped:

@@ -64,7 +64,7 @@ class StepReport:
     depth: float  # deepest penetration [m]
     error: float  # largest magnetization error of a substep
     evaluations: int  # field evaluations of all substeps
-    unconverged: int  # substeps without convergence of the induction
+    unconverged: int  # induction solves that did not converge
     seconds: tuple[float, float, float] | None  # times of induction, forces, rigid bodies [s]; None while compiling
 
 
