@@ -32,8 +32,8 @@ error of the field there from the Gauss points along one axis; largest number of
 the distance is increased."""
 _FAR_REACH, _FAR_REMAINDER = 5.0, 1.2e-4
 """For the few moments that replace a body farther off: smallest distance, in halves of the body's largest side, and
-relative error along one axis. A cube and a disc have 8. Gradients of their fields have an error of up to 3e-3 there,
-which falls off with the fourth power of the distance."""
+relative error along one axis. A cube and a disc have 8, slender boxes 2. Gradients of their fields have an error of up
+to 5e-3 there, which falls off with the fourth power of the distance."""
 
 
 @dataclass(frozen=True)

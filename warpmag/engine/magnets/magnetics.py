@@ -51,7 +51,7 @@ from warpmag.terminal import collection_paused
 class Magnetics:
     """The magnets of a Newton model: their induction, forces and fields.
 
-    A ball without a ``moment_spacing`` is one moment. Most permanent boxes and cylinders are 4 to 8 moments with a
+    A ball without a ``moment_spacing`` is one moment. Most permanent boxes and cylinders are 2 to 8 moments with a
     closed-form near field. Any other magnet is a lattice of moments with the exact volume; iron acts by fewer moments
     if it is far from all other magnets. Moments of one body exert no forces on each other, and magnets of different
     worlds do not interact. Use any solver that reads ``State.body_f``::
