@@ -18,7 +18,7 @@ VIEWERS = {"gl": "ViewerGL", "viser": "ViewerViser", "rerun": "ViewerRerun"}
 _DEVICE = "Warp device, cpu or cuda:0 (default: the first GPU, else cpu)"
 _CONTACT_MODEL = (
     "model of balls that nearly touch (default: the stage's, else dipole, which underestimates the attraction of two "
-    "balls in line with the field by 34 %% at a gap of 0.3 radii and by 93 %% at 0.01)"
+    "balls in line with the field by up to 34 %% at a gap of 0.3 radii and 93 %% at 0.01)"
 )
 _STAGE = "a USD file, or a bundled scene (see 'warpmag scenes')"
 _RUN_EXAMPLES = """

@@ -29,7 +29,7 @@ CURVES = ("tanh", "langevin", "clamped", "frohlich", "tanh-applied")
 """Formulas of magnetization curves (``kernels.material.curves``); a model stores the position in this list.
 
 A formula is a function of the field of all other sources for a ball, and of the field inside the material for a cell.
-``tanh-applied``, which the paper's scenes use, is ``tanh`` in the field of all others for cells, too.
+``tanh-applied``, which the scene Alphabets uses, is ``tanh`` in the field of all others for cells, too.
 """
 FORCES = ("kelvin", "zeeman")
 CONTACT_MODELS = ("dipole", "multipole")
@@ -213,7 +213,7 @@ class MagneticSettings:
     contact_model: Annotated[str, Attribute(
         "contactModel", "token", "Contact Model",
         "Interaction of balls that nearly touch. dipole: with the dipoles alone two balls in line with the field "
-        "attract too weakly, by 34 % at a gap of 0.3 radii and by 93 % at 0.01. multipole: also the higher "
+        "attract too weakly, by up to 34 % at a gap of 0.3 radii and 93 % at 0.01. multipole: also the higher "
         "multipoles of the exact solution of two balls; requires the force law kelvin.",
         tokens=CONTACT_MODELS, uniform=True,
     )] = "dipole"  # fmt: skip
