@@ -14,6 +14,7 @@ from warpmag.declarations.magnets import Magnet, MagneticSettings
 from warpmag.engine.pile_xpbd.contacts import RigidSolver, body_sizes
 from warpmag.engine.stepping.held_bodies import find_held
 from warpmag.engine.stepping.simulation import Simulation
+from warpmag.engine.stepping.statistics import Statistics
 from warpmag.engine.stepping.stepper import OVERLAP_LIMIT, TRAVEL_LIMIT, Stepper
 from warpmag.kernels.rigid.monitor import UNCONSTRAINED_WEIGHT
 from warpmag.kernels.shared.scan import launch_scan
@@ -393,6 +394,13 @@ def test_overlaps_at_the_start_are_counted(device):
     simulation = Simulation(builder, device=device)
     assert simulation.statistics.overlapping == 1
     assert simulation.statistics.warnings() == ["1 pair of bodies overlaps at the start"]
+
+
+def test_a_warning_counts_unconverged_solves():
+    """Short substeps share a solve, so these are not numbers of substeps."""
+    lines = [Statistics(substeps=6, unconverged=count).warnings() for count in (0, 1, 2)]
+    words = ["1 induction solve did not converge, in 6 substeps", "2 induction solves did not converge, in 6 substeps"]
+    assert lines == [[], words[:1], words[1:]]
 
 
 def test_gaps_follow_the_size_of_the_bodies(reference):
