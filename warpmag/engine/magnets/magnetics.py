@@ -52,8 +52,8 @@ class Magnetics:
     """The magnets of a Newton model: their induction, forces and fields.
 
     A ball without a ``moment_spacing`` is one moment. Most permanent boxes and cylinders are 2 to 8 moments with a
-    closed-form near field. Any other magnet is a lattice of moments with the exact volume; iron acts by fewer moments
-    if it is far from all other magnets. Moments of one body exert no forces on each other, and magnets of different
+    closed-form near field. Any other magnet is a lattice of moments with the exact volume; fewer moments represent iron
+    that is far from all other magnets. Moments of one body exert no forces on each other, and magnets of different
     worlds do not interact. Use any solver that reads ``State.body_f``::
 
         magnetics = warpmag.Magnetics(model)
