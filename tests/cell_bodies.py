@@ -85,9 +85,9 @@ def demagnetizing_matrix(body, coupling=None):
 
 
 def coupled(body, solids):
-    """Coupling of a body's cells, as a model has it."""
+    """Coupling of the cells of a body, as a model has it for the only iron of a world."""
     cells = linear_cells.with_slopes(demagnetization.coupling(body, body.radii), body)
-    return uniform_response.with_surface_response(cells, body, solids)
+    return uniform_response.with_surface_response(cells, body, solids).among(1, balls=False)
 
 
 def pair_corrections(bodies, couplings, poses):

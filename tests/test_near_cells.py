@@ -144,6 +144,27 @@ def test_magnet_in_contact_pulls_right_wherever_the_cells_are(shift, device):
     assert forces[1, 2] == pytest.approx(expected, rel=0.07)
 
 
+@pytest.mark.parametrize("gap", ["0.02", "1"])
+def test_fine_cells_of_thick_iron_pull_right(gap, device):
+    """With all of the linear charges of faces the pull was 8 % too strong. Half of them leave 1 and 3 %."""
+    name = f"magnet μ 1 over iron plate 10, gap {gap}"
+    forces, _, _ = iron.model_forces(SETUPS[name], 2000, device, "dipole")
+    assert forces[1, 2] == pytest.approx(load()[name]["forces"][1][2], rel=0.05)
+
+
+def test_thin_plate_that_is_the_only_iron_pulls_right(device):
+    """The error is 1.7 %; it is 3.1 % beside other iron, where less of the sawtooth of its slopes is subtracted."""
+    name = "magnet μ 1 over iron plate 1, gap 1"
+    expected, magnet = load()[name]["forces"][1][2], SETUPS[name].bodies[1]
+    ball = Body("ball", (0.005,), (0.0, 0.0, 0.3))
+    errors = []
+    for setup in (SETUPS[name], replace(SETUPS[name], bodies=(*SETUPS[name].bodies, ball))):
+        assert setup.bodies[1] is magnet
+        forces, _, _ = iron.model_forces(setup, 0, device, "dipole")
+        errors.append(abs(forces[1, 2] / expected - 1.0))
+    assert errors[0] < 0.025 < errors[1] < 0.04
+
+
 @pytest.mark.parametrize("depth", [0.0, 2e-6, 5e-5])
 def test_magnet_that_has_sunk_into_iron_is_still_pulled(depth, device):
     """Contacts let bodies overlap a little. The pull grows as outside, by about 12 % in 0.1 mm."""
@@ -171,7 +192,8 @@ def test_slopes_keep_the_energy_of_uniform_magnetization(solid):
     """It has neither slopes nor a curl, except where the surface cuts cells. The operator stays positive."""
     body = lattice.fill(solid, 0.0, lattice.LEAST_ACROSS, together=True)
     uniform = demagnetization.coupling(body, body.radii)
-    before, after = (demagnetizing_matrix(body, coupling) for coupling in (uniform, with_slopes(uniform, body)))
+    linear = with_slopes(uniform, body).among(1, balls=False)
+    before, after = (demagnetizing_matrix(body, coupling) for coupling in (uniform, linear))
     for axis in np.eye(3):
         m = np.outer(np.sqrt(body.volumes), axis).ravel()
         np.testing.assert_allclose(m @ after @ m, m @ before @ m, rtol=1e-10)

@@ -10,7 +10,7 @@ from warpmag.kernels.applied.near_cells import FACE_SPLIT, NearCellBody
 from warpmag.kernels.cells.cell_pairs import CellPairs
 from warpmag.kernels.cells.couplings import CellCouplings
 from warpmag.moments.layout import MomentLayout
-from warpmag.shapes.demagnetization import Coupling
+from warpmag.shapes.demagnetization import Coupling, couplings_in_worlds
 from warpmag.shapes.face_charges import face_response
 
 
@@ -40,11 +40,13 @@ class SystemCells:
         rotatable, packed, moments, h, forces, torques,
     ):  # fmt: skip
         """Lay out the tables on the device of the moments."""
-        worlds, copies = layout.worlds[[first for first, _ in couplings]], range(layout.copies)
+        firsts = [first for first, _ in couplings]
+        worlds, copies = layout.worlds[firsts], range(layout.copies)
         self._takes_part = [coupling.near and first not in closed_forms for first, coupling in couplings]
-        in_world = np.bincount(worlds)[worlds].tolist()
-        bodies = [(first, coupling.among(count)) for (first, coupling), count in zip(couplings, in_world, strict=True)]
+        ball_worlds = set(layout.worlds[layout.single_balls & ~layout.permanent].tolist())
+        among = couplings_in_worlds([coupling for _, coupling in couplings], worlds.tolist(), ball_worlds)
         step = len(layout.radii)
+        bodies = list(zip(firsts, among, strict=True))
         self.bodies = [(first + step * copy, coupling) for copy in copies for first, coupling in bodies]
         parts = np.bincount(worlds, self._takes_part, layout.world_count)
         paired = bool(parts.max() > 1) or bool(parts[layout.worlds[layout.single_balls]].any())

@@ -15,6 +15,8 @@ correction: for cells nearer than :data:`EXACT_REACH`, the exact tensor minus th
 itself, the 1/3 that the magnetization curve of a ball contains is subtracted instead.
 """
 
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -59,6 +61,7 @@ class Slopes:
     neighbor: np.ndarray  # neighbor of each cell on each side, the cell itself where there is none, shape [n, 6]
     weight: np.ndarray  # weights w of the neighbors, shape [n, 6]
     tensor: np.ndarray  # T_ij [1/m³] for the entries of the coupling, H_i += Σ T_ij m_j, shape [entries, 3, 3]
+    alone: np.ndarray  # change of the xx, yy and zz of T_ij where no other iron is near [1/m³], shape [entries, 3]
 
 
 @dataclass(frozen=True)
@@ -96,16 +99,23 @@ class Coupling:
         local = self.positions @ rotate(self.grid_rotation[None], np.eye(3)).T
         return self.slopes is not None and bool((np.ptp(local, axis=0) < 1.5 * self.cell_sides).any())
 
-    def among(self, bodies: int) -> "Coupling":
+    def among(self, bodies: int, *, balls: bool) -> "Coupling":
         """Return the coupling in a world with a number of bodies of cells, itself included; one for all of a shape.
 
         C replaces charges near edges. Where bodies touch there are none, so each gets C over the number of bodies. With
-        all of C the operator of a ring, whose flux is closed, would not be positive.
+        all of C the operator of a ring, whose flux is closed, would not be positive. ``balls`` says whether the world
+        has balls of iron. The slopes of the only iron of a world get the whole of what ``linear_cells.py`` subtracts.
         """
-        return self if bodies == 1 else self._among.setdefault(bodies, replace(self, common=self.common / bodies))
+        if (bodies, balls) not in self._among:
+            slopes = self.slopes
+            if slopes is not None and bodies == 1 and not balls:
+                tensor = slopes.tensor + slopes.alone[..., None] * np.eye(3)
+                slopes = replace(slopes, tensor=tensor, alone=np.zeros_like(slopes.alone))
+            self._among[bodies, balls] = replace(self, common=self.common / bodies, slopes=slopes)
+        return self._among[bodies, balls]
 
     @cached_property
-    def _among(self) -> dict[int, "Coupling"]:
+    def _among(self) -> dict[tuple[int, bool], "Coupling"]:
         return {}
 
     @property
@@ -134,6 +144,21 @@ class Coupling:
             return np.zeros((len(self.radii), 12))
         ratio = (self.radii[:, None] / self.radii[self.neighbor]) ** 3
         return np.concatenate([self.slopes.weight, self.slopes.weight * ratio], axis=1)
+
+
+def couplings_in_worlds(couplings: Sequence[Coupling], worlds: Sequence[int], ball_worlds: set[int]) -> list[Coupling]:
+    """Return the couplings of bodies among the other iron of their worlds.
+
+    Args:
+        couplings: Coupling of each body of cells.
+        worlds: World of each of these bodies.
+        ball_worlds: Worlds with balls of iron.
+    """
+    count = Counter(worlds)
+    return [
+        coupling.among(count[world], balls=world in ball_worlds)
+        for coupling, world in zip(couplings, worlds, strict=True)
+    ]
 
 
 def pair_law_tensors(positions: np.ndarray, radii: np.ndarray) -> np.ndarray:

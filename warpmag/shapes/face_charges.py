@@ -9,6 +9,12 @@ and keeps the average field of each cell near 0. So φ is the potential less tha
 R = Q (Qᵀ S Q)⁻¹ Qᵀ, where the columns of Q span all charges without a sum. The energy is −½ μ0 φᵀ R φ. A body of finite
 susceptibility χ responds by χ/(χ + 2) of that, as a half-space does. Charges of different faces do not act on each
 other: they fall off fast.
+
+The part of q that varies linearly over a face is too large where the field is smooth. Over an ideal half-space a
+potential cos kx at the surface has the charges 2 k cos kx. Along a face of side l they vary by 2 k² l. The cells leave
+the potential a slope of k² d/2 of second order, since their average field is that at half their depth d, and R makes it
+charges that vary by k² d/(2 c) with c = 0.09. The ratio of both is 4 c l/d = 0.36 l/d. Edges of magnets need up to all
+of q. So the linear part of q along a side is multiplied by :data:`_LINEAR` l/d, at most 1.
 """
 
 from functools import cache
@@ -17,6 +23,9 @@ import numpy as np
 
 from warpmag.shapes.uniform_response import potentials
 
+_LINEAR = 0.5
+"""Share of linear charges for cells that are cubes. Of 0.36, 0.5 and 1, it gives the least error for magnets over 10 mm
+of iron with 700 and 1,800 cells, in contact and at 1 mm: −3 to +3 %; 0.36 −7 to +2 %, and 1 +1 to +8 %."""
 _GAUSS_POINTS = 3
 """Points along each side of a square, over which its potential is averaged."""
 
@@ -33,11 +42,12 @@ def face_response(sides: tuple[float, float, float], split: int) -> np.ndarray:
         (3, 16, 16)
     """
     others = (1, 2), (0, 2), (0, 1)
-    return np.stack([_rectangle_response(np.array([sides[k] for k in axes]), split) for axes in others])
+    lengths = np.array(sides)
+    return np.stack([_rectangle_response(lengths[list(axes)], lengths[k], split) for k, axes in enumerate(others)])
 
 
-def _rectangle_response(sides: np.ndarray, split: int) -> np.ndarray:
-    """Return R [m] of a rectangle with ``sides`` [m], shape [2], on split × split rectangles."""
+def _rectangle_response(sides: np.ndarray, depth: float, split: int) -> np.ndarray:
+    """Return R [m] of a face with ``sides`` [m], shape [2], of a cell of a depth [m], on split × split rectangles."""
     step = sides / split
     middles = [(np.arange(split) + 0.5) / split - 0.5 for _ in range(2)]
     unit = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -50,4 +60,8 @@ def _rectangle_response(sides: np.ndarray, split: int) -> np.ndarray:
     self_potential = np.einsum("ipj,p->ij", at_points, 0.25 * np.outer(weights, weights).ravel())
     self_potential = 0.5 * (self_potential + self_potential.T)
     other = np.linalg.svd(np.ones((len(unit), 1)))[0][:, 1:]
-    return other @ np.linalg.solve(other.T @ self_potential @ other, other.T)
+    response = other @ np.linalg.solve(other.T @ self_potential @ other, other.T)
+    linear = unit / np.linalg.norm(unit, axis=0)
+    root = linear * (1.0 - np.sqrt(np.minimum(_LINEAR * sides / depth, 1.0))) @ linear.T
+    reduced = np.eye(split**2) - root
+    return reduced @ response @ reduced

@@ -24,7 +24,8 @@ demagnetizing factor
     1 − tanh(p/2)/(p/2),    p = 4π t/l.
 
 Only this part of the energy is subtracted. With all of it the energy of a sheet could be negative, and the solve of a
-sheet of 60 × 60 × 0.1 mm on a plate would not converge.
+sheet of 60 × 60 × 0.1 mm on a plate would not converge. A body that is the only iron in its world has no such
+neighbors. It gets all of it, which is right within 2 % for a magnet over a plate of 1 mm instead of 3 %.
 
 Magnetizations without charges have no energy. In iron they do not occur, because M follows the curl-free field H. But
 conjugate gradients need many steps for them, and errors of distant pairs of cells would make their energy negative. So
@@ -63,8 +64,9 @@ def with_slopes(coupling: Coupling, lattice: Lattice) -> Coupling:
     for k in range(3):
         for j in range(k, 3):
             tensor[:, k, j], tensor[:, j, k] = operator.entries(k, j)
-    tensor /= np.sqrt(lattice.volumes[operator.row] * lattice.volumes[coupling.other])[:, None, None]
-    return replace(coupling, slopes=Slopes(neighbor, weight, tensor))
+    roots = np.sqrt(lattice.volumes[operator.row] * lattice.volumes[coupling.other])[:, None]
+    alone = np.stack([operator.sawtooth(k) for k in range(3)], axis=1) / roots
+    return replace(coupling, slopes=Slopes(neighbor, weight, tensor / roots[..., None], alone))
 
 
 def _cell_indices(part: Pieces) -> np.ndarray:
@@ -112,7 +114,9 @@ class _Operator:
         offsets, inverse = np.unique(index[self.row] - index[self.other], axis=0, return_inverse=True)
         shares = (scale / part.sides.prod())[:, None, None]
         self._differences = [-block[inverse.reshape(-1)] * shares for block in half_cell_tensors(offsets, part.sides)]
-        self._differences[2][own] += np.diag(_within_half(index, part.sides))
+        within_half = _within_half(index, part.sides)
+        self._differences[2][own] += np.diag(within_half)
+        self._left_sawtooth = _WITHIN_HALF - within_half
         self._slopes = [self._difference(axis) for axis in range(3)]
         self._curls = [self._curl(axis, part.sides) for axis in range(3)]
 
@@ -145,6 +149,11 @@ class _Operator:
             if k in curl and j in curl:
                 block -= _CURL * (curl[k].T @ curl[j])
         return (block + eye_array(n) / 3.0 if k == j else block).tocsr()
+
+    def sawtooth(self, k: int) -> np.ndarray:
+        """Return the entries of the rest of the energy of the sawtooth along axis k, shape [entries]."""
+        slope = self._slopes[k]
+        return self._left_sawtooth[k] * (slope.T @ slope).tocsr()[self.row, self.other]
 
     def _difference(self, axis: int) -> csr_array:
         """Return D of √V M along an axis, shape [n, n]."""

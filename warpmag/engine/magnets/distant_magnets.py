@@ -1,6 +1,5 @@
 """Few moments in place of the cells of iron bodies in worlds where every other magnet keeps a distance from them."""
 
-from collections import Counter
 from dataclasses import replace
 from functools import partial
 
@@ -24,7 +23,7 @@ from warpmag.moments.ranks import current_ranks
 from warpmag.moments.resting_worlds import RestingWorlds
 from warpmag.moments.system import MomentSystem
 from warpmag.shapes import distant_response
-from warpmag.shapes.demagnetization import Coupling
+from warpmag.shapes.demagnetization import Coupling, couplings_in_worlds
 from warpmag.shapes.distant_response import LEAST_REPLACED_CELLS, MOST_REPLACED_CELLS, DistantBody
 
 
@@ -52,11 +51,14 @@ def distant_bodies(
     large = {k: lattice for k, lattice in coupled.items() if len(lattice.volumes) >= LEAST_REPLACED_CELLS}
     if any(len(lattice.volumes) > MOST_REPLACED_CELLS for lattice in large.values()):
         return {}
-    in_world = Counter(magnets[k].world for k in coupled)
+    ball_worlds = {magnet.world for k, magnet in enumerate(magnets) if k not in coupled and not magnet.magnet.fixed}
+    couplings = [lattice.coupling for lattice in coupled.values()]
+    among = couplings_in_worlds(couplings, [magnets[k].world for k in coupled], ball_worlds)
+    coupling_of = dict(zip(coupled, among, strict=True))
     bodies: dict[int, list[DistantBody] | None] = {}
     result = {}
     for k, lattice in large.items():
-        coupling = lattice.coupling.among(in_world[magnets[k].world])
+        coupling = coupling_of[k]
         if id(coupling) not in bodies:
             bodies[id(coupling)] = _few_moments(model.shape_label[magnets[k].shapes[0]], lattice, coupling)
         if (body := bodies[id(coupling)]) is None:
