@@ -304,6 +304,36 @@ def test_bodies_that_move_together_keep_their_tensors(device):
     assert changed <= 1e-4 * np.abs(before).max()  # poses that rounding moves by more than the tolerance
 
 
+def test_tables_rest_until_a_box_moves(device):
+    """A find at equal poses leaves the tables alone. A motion, a search and restored arrays change them."""
+    bodies, place = [CUBE, PLATE], [(Rotation.identity(), np.zeros(3)), (Rotation.identity(), np.array([0, 0, 0.0071]))]
+    system, _ = make_pair(bodies, place, dtype="float32", device=device, susceptibility=math.inf)
+    system.solve()
+    pairs = system._cells.pairs
+    kept = {name: wp.clone(array) for name, array in pairs.persistent_arrays().items()}
+    exact = pairs.arrays.matrix.numpy().copy()
+
+    def changes_by_find():
+        before = pairs.arrays.matrix.numpy().copy()
+        system.begin()
+        return bool((pairs.arrays.matrix.numpy() != before).any())
+
+    pairs.arrays.pose.fill_(9.0)  # of no pair: a visit computes all tensors again
+    pairs.arrays.matrix.zero_()
+    assert not changes_by_find()
+    put(system, bodies, [place[0], (Rotation.identity(), np.array([1e-4, 0.0, 0.0071]))])
+    assert changes_by_find()
+    for name, array in pairs.persistent_arrays().items():
+        wp.copy(array, kept[name])
+    put(system, bodies, place)
+    assert not changes_by_find()
+    np.testing.assert_array_equal(pairs.arrays.matrix.numpy(), exact)
+    pairs.arrays.matrix.zero_()
+    pairs.request_search(wp.ones(1, dtype=int, device=device))
+    assert changes_by_find()
+    np.testing.assert_allclose(pairs.arrays.matrix.numpy(), exact, atol=1e-6 * np.abs(exact).max())
+
+
 def test_pairs_that_leave_and_enter_the_window(device):
     """Fields after small motions through the end of the window equal those after a search."""
     bodies, ends = [CUBE, PLATE], set()

@@ -17,7 +17,7 @@ class Windows(NamedTuple):
 
     all: tuple[float, float]  # of all boxes
     close: tuple[float, float]  # of boxes that are integrated over
-    fine: tuple[float, float]  # of flat boxes that have fine points
+    fine: tuple[float, float]  # of flat boxes that have fine points, in means of longest sides
     flat: float  # ratio of the two shortest sides of flat boxes
 
 
@@ -100,7 +100,8 @@ def pair_correction(a, b, windows: Windows) -> np.ndarray:
         return np.zeros((3, 3))
 
     source, target = (b, a) if half.prod() <= other_half.prod() * 1.0005 else (a, b)
-    of_larger = blended_tensor(source, target, is_flat(target[2], windows.flat) * fade(distance, windows.fine))
+    sides = d / (half.max() + other_half.max())
+    of_larger = blended_tensor(source, target, is_flat(target[2], windows.flat) * fade(sides, windows.fine))
     spread = turn @ np.diag(half**2 / 3.0) @ turn.T + other_turn @ np.diag(other_half**2 / 3.0) @ other_turn.T
     g1, g2, _ = oracle.radial_factors(np.array([d]), radii[0], radii[1])
     ball = (g1[0] * np.eye(3) + g2[0] * np.outer(r, r)) / (4.0 * np.pi)

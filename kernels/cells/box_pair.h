@@ -72,11 +72,13 @@ CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, cons
     const Number unit = 2 / (own.size + other.size);
     const Vector r = unit * pose.r;
     const Number d = length(r);
-    Window close = window_between(d, CLOSE_BEGIN, CLOSE_END, listed);
     const Number own_longest = longest_of(own), other_longest = longest_of(other);
     const Mask own_shorter = own_longest < SHORTER * other_longest, alike = own_longest * SHORTER <= other_longest;
     const Mask own_points = own_shorter | (own_first & alike);
     const Mask flat = own_points ? own.flat : other.flat;
+    const Number per_side = 1 / (unit * (own_longest + other_longest)); // from units of the pair to mean longest sides
+    Window fine = window_between(per_side * d, FINE_BEGIN, FINE_END, listed & flat);
+    fine.slope *= per_side;
     return {unit * own.half,
             unit * other.half,
             r,
@@ -85,8 +87,8 @@ CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, cons
             unit * own.radius,
             unit * other.radius,
             window_between(d, WINDOW_BEGIN, WINDOW_END, listed),
-            close,
-            window_between(d, FINE_BEGIN, FINE_END, listed & flat),
+            window_between(d, CLOSE_BEGIN, CLOSE_END, listed),
+            fine,
             own_points,
             own_points ? other.ball : own.ball,
             own_points ? own.ball : other.ball,

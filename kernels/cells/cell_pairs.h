@@ -356,7 +356,8 @@ template <class Pairs> CUDA_CALLABLE inline void arrange_rows(const Pairs& a, in
 
 template <class Pairs> CUDA_CALLABLE inline void make_cell_pair_pass(const Pairs& a, int pass, int i) {
     if (pass >= TABULATE && pass != TAKE_BALLS) {
-        if (i >= a.cell.shape[0]) return;
+        const bool rests = pass == TABULATE && a.searching.data[0] == 0 && a.displaced.data[0] == 0;
+        if (i >= a.cell.shape[0] || rests) return;
         if (pass == TABULATE) tabulate(a, i);
         else if (pass == ADD_FIELD) add_field(a, i);
         else if (pass == ADD_FORCE) add_force(a, i);

@@ -19,19 +19,21 @@ constexpr Real BALL = Real(4.1887902047863905);  // volume of a ball over r³
 
 constexpr int CLASSES = 16, BINS = CLASSES * CLASSES; // of rows by their numbers of close and of all candidates
 
-// Writes the box of moment i, and raises a flag if it has moved so far that candidates are searched again.
+// Writes the box of moment i. Raises a flag if it has moved at all, and another one if candidates are searched again.
 template <class Pairs> CUDA_CALLABLE inline void locate(const Pairs& a, int i) {
     if (i >= a.group.shape[0] || a.group.data[i] < 0) return;
     const Real *const row = (const Real*)a.packed.data + i, *const half = a.half.data + i;
     const size_t pitch = a.packed.strides[0] / sizeof(Real), cells = a.half.shape[1];
     const int body = a.body.data[i];
     const bool is_ball = body >= a.grid.shape[0];
-    Real* const line = a.box.data + LINE * (size_t)i;
-    Real* const turn = line + 8;
+    Real line[LINE], *const turn = line + 8, *const stored = a.box.data + LINE * (size_t)i;
     for (int k = 0; k < 4; ++k) line[k] = row[k * pitch], line[4 + k] = half[k * cells], turn[k] = k == 3;
     if (!is_ball) put_product(a.rotation.data[body], a.grid.data[body], turn);
     line[12] = is_ball ? BALL * line[3] * line[3] * line[3] : 8 * line[4] * line[5] * line[6];
     line[13] = is_ball, line[14] = a.linear.data[body] + 2 * a.flat.data[body], line[15] = a.inducible.data[i];
+    bool same = true;
+    for (int k = 0; k < LINE; ++k) same = same && stored[k] == line[k], stored[k] = line[k];
+    if (!same) raise_flag(*a.displaced.data);
     const Real* const listed = (const Real*)a.found_at.data + 3 * (size_t)i;
     const Real x = line[0] - listed[0], y = line[1] - listed[1], z = line[2] - listed[2];
     const Real limit = MARGIN / 2 * line[7];
@@ -63,11 +65,12 @@ template <class Pairs> CUDA_CALLABLE inline int distance_of(const Pairs& a, int 
     auto longest_half = [](const Real* line) { return larger(line[4], larger(line[5], line[6])); };
     const Real r[3] = {other[0] - own[0], other[1] - own[1], other[2] - own[2]};
     const Real d2 = r[0] * r[0] + r[1] * r[1] + r[2] * r[2];
-    const Real size = (own[7] + other[7]) / 2, d = (CLOSE_END + MARGIN) * (longest_half(own) + longest_half(other));
-    const bool close = d2 < CLOSE_END * size * CLOSE_END * size;
-    const bool flat = own[14] >= 2 || other[14] >= 2, fine = flat && d2 < FINE_END * size * FINE_END * size;
-    if (d2 < d * d) return fine ? FINE_NOW : close ? CLOSE_NOW : MAY_BE_CLOSE;
-    return close ? CLOSE_AND_FLAT : d2 < WINDOW_END * size * WINDOW_END * size ? NEAR_NOW : MAY_BE_NEAR;
+    const Real size = (own[7] + other[7]) / 2, longest = longest_half(own) + longest_half(other);
+    auto within = [=](Real reach) { return d2 < reach * reach; };
+    const bool close = within(CLOSE_END * size), flat = own[14] >= 2 || other[14] >= 2;
+    const bool fine = flat && within(FINE_END * longest);
+    if (within((CLOSE_END + MARGIN) * longest)) return fine ? FINE_NOW : close ? CLOSE_NOW : MAY_BE_CLOSE;
+    return close ? CLOSE_AND_FLAT : within(WINDOW_END * size) ? NEAR_NOW : MAY_BE_NEAR;
 }
 
 // Kind of candidate j of cell i, in the order of a row.
@@ -98,7 +101,7 @@ template <class Pairs> CUDA_CALLABLE inline void select(const Pairs& a, int i) {
     }
     for (int n = 0; n < KINDS; ++n) kinds[n] = group_count(kinds[n]);
     if (share() != 0) return;
-    a.bin.data[i] = CLASSES * class_of(kinds[FINE_NOW] + kinds[CLOSE_NOW]) + class_of(count / 16);
+    a.bin.data[i] = CLASSES * class_of(kinds[FINE_NOW]) + class_of(count / 32);
     for (int n = 0, end = 0; n < KINDS; ++n) a.kind_end.data[KINDS * (size_t)i + n] = end += kinds[n];
     if (end_of_kinds(a, i, CLOSE_KINDS) > a.close_capacity && a.close_capacity > 0) raise_flag(*a.crowded.data);
     increment(a.bin_end.data + a.bin.data[i]);
