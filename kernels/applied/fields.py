@@ -35,6 +35,8 @@ _TARGETS_PER_THREAD, _BALLS_PER_THREAD, _CELLS_PER_THREAD = 500, 50, 50
 _PER_ROW, _MOST_ROWS = {OF_TARGETS: 256, OF_BALLS: 8, OF_CELLS: 8}, 64
 """Fewest targets, balls and cells in a row of a reaction, and most rows of a source."""
 _GROUP = 32  # threads of a GPU that share a source, or a row of its reaction
+_CELL_GROUP, _CELL_BLOCK = 8, 64
+"""Threads of a GPU that share a cell, and those of a block: more would leave registers for fewer blocks."""
 
 
 @cache
@@ -132,6 +134,8 @@ class AppliedField:
             of_cells = dict.fromkeys((FIND_CELLS, AT_CELLS, AT_NEIGHBORS, ON_CELLS), self.arrays.cells.active)
             active = {AT_TARGETS: self.arrays.targets.active, **of_cells}.get(first)
             sizes["max_blocks"] = most_blocks(self.device) if active else 0
+            if first in (AT_CELLS, ON_CELLS):
+                sizes["block_dim"] = _CELL_BLOCK
             self._commands[key] = launch_passes(
                 kernel, first, last + 1, self.arrays, device=self.device, record_cmd=True, **sizes
             )
@@ -144,7 +148,7 @@ class AppliedField:
         if self.device.is_cpu:
             self.run_passes(FIND_CELLS, AT_NEIGHBORS, self.cell_count, 1, _CELLS_PER_THREAD)
             return
-        for number, group in ((FIND_CELLS, 1), (AT_CELLS, _GROUP), (AT_NEIGHBORS, 1)):
+        for number, group in ((FIND_CELLS, 1), (AT_CELLS, _CELL_GROUP), (AT_NEIGHBORS, 1)):
             self.run_passes(number, number, self.cell_count, group, 1)
 
     def launch_left_out(self):
@@ -383,7 +387,7 @@ class AppliedForces(AppliedField):
             self.arrays.effective, self.arrays.balls.response = effective, response
             self._commands = {key: command for key, command in self._commands.items() if key[1] < ON_CELLS}
         if self._moves or self._reacts:
-            self.run_passes(ON_CELLS, ON_CELLS, self.cell_count, _GROUP, _CELLS_PER_THREAD)
+            self.run_passes(ON_CELLS, ON_CELLS, self.cell_count, _CELL_GROUP, _CELLS_PER_THREAD)
         if self._adds:
             self._add_up(REACT if self._reacts else ADD_UP)
         if not self._moves:

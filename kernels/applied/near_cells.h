@@ -396,7 +396,8 @@ template <class Arrays>
 CUDA_CALLABLE inline void wrench_on_cells(const Arrays& arrays, int b, bool only, int first, int last, Real3& force,
                                           Real3& torque) {
     const Real3 center = reference_point(arrays, body_at(arrays, b));
-    for (int c = first; c < last; ++c) {
+    // threads share what has been written, or each cell
+    for (int c = first + (only ? share() : 0); c < last; c += only ? SHARES : 1) {
         if (!arrays.cells.near.data[c]) continue;
         Real3 f = {0, 0, 0}, t = f;
         if (only) {
@@ -408,5 +409,8 @@ CUDA_CALLABLE inline void wrench_on_cells(const Arrays& arrays, int b, bool only
         force += f;
         torque += t + cross(packed_real3(arrays, 0, arrays.cells.cell.data[c][0]) - center, f);
     }
+#if defined(__CUDA_ARCH__)
+    if (only) force = total_of(broadcast(force)), torque = total_of(broadcast(torque));
+#endif
 }
 }

@@ -17,6 +17,9 @@ from warpmag.kernels.shared.team import launch_passes, threads_for
 
 DIFFERENCES, UNIFORM_FIELD, TRANSPOSE, ADD = range(4)  # the passes, in order; as in ``couplings.h``
 _CELLS_PER_THREAD = 500  # cells per thread of a CPU, at least
+_FEW_THREADS, _MANY_CELLS = 2, 50_000
+"""Threads of a GPU that share a cell where cells alone fill the GPU, and the number of such cells. Few threads a cell
+read neighboring entries of the table together."""
 
 
 @cache
@@ -138,7 +141,7 @@ class CellCouplings:
     @staticmethod
     def _record(couplings, first: int, last: int):
         device, rows = couplings.h.device, CHUNK * couplings.chunk.shape[0]
-        group = group_threads(device)
+        group = _FEW_THREADS if device.is_cuda and rows >= _MANY_CELLS else group_threads(device)
         sizes = dict(threads=threads_for(rows, _CELLS_PER_THREAD), gpu_threads=group * rows)
         sizes["max_blocks"] = most_blocks(device) if couplings.active else 0
         kernel = _kernel(couplings.tensor.dtype, group)
