@@ -44,7 +44,8 @@ class SystemCells:
         worlds, copies = layout.worlds[firsts], range(layout.copies)
         self._takes_part = [coupling.near and first not in closed_forms for first, coupling in couplings]
         ball_worlds = set(layout.worlds[layout.single_balls & ~layout.permanent].tolist())
-        among = couplings_in_worlds([coupling for _, coupling in couplings], worlds.tolist(), ball_worlds)
+        iron = [first not in closed_forms for first in firsts]
+        among = couplings_in_worlds([coupling for _, coupling in couplings], worlds.tolist(), iron, ball_worlds)
         step = len(layout.radii)
         bodies = list(zip(firsts, among, strict=True))
         self.bodies = [(first + step * copy, coupling) for copy in copies for first, coupling in bodies]

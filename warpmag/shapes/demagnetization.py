@@ -146,17 +146,20 @@ class Coupling:
         return np.concatenate([self.slopes.weight, self.slopes.weight * ratio], axis=1)
 
 
-def couplings_in_worlds(couplings: Sequence[Coupling], worlds: Sequence[int], ball_worlds: set[int]) -> list[Coupling]:
+def couplings_in_worlds(
+    couplings: Sequence[Coupling], worlds: Sequence[int], iron: Sequence[bool], ball_worlds: set[int]
+) -> list[Coupling]:
     """Return the couplings of bodies among the other iron of their worlds.
 
     Args:
         couplings: Coupling of each body of cells.
         worlds: World of each of these bodies.
+        iron: False for permanent magnets with recoil permeability, which hardly respond.
         ball_worlds: Worlds with balls of iron.
     """
-    count = Counter(worlds)
+    count = Counter(world for world, is_iron in zip(worlds, iron, strict=True) if is_iron)
     return [
-        coupling.among(count[world], balls=world in ball_worlds)
+        coupling.among(max(count[world], 1), balls=world in ball_worlds)
         for coupling, world in zip(couplings, worlds, strict=True)
     ]
 

@@ -24,8 +24,9 @@ import numpy as np
 from warpmag.shapes.uniform_response import potentials
 
 _LINEAR = 0.5
-"""Share of linear charges for cells that are cubes. Of 0.36, 0.5 and 1, it gives the least error for magnets over 10 mm
-of iron with 700 and 1,800 cells, in contact and at 1 mm: −3 to +3 %; 0.36 −7 to +2 %, and 1 +1 to +8 %."""
+"""Share of linear charges for cells that are cubes. For magnets over 10 mm of iron with 700 and 1,800 cells, in contact
+and at 1 mm, the errors are then −3 to +3 %. With a share of 0.36 they are −7 to +2 %, and with all linear charges +1 to
++8 %."""
 _GAUSS_POINTS = 3
 """Points along each side of a square, over which its potential is averaged."""
 

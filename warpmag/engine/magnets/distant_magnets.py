@@ -53,7 +53,7 @@ def distant_bodies(
         return {}
     ball_worlds = {magnet.world for k, magnet in enumerate(magnets) if k not in coupled and not magnet.magnet.fixed}
     couplings = [lattice.coupling for lattice in coupled.values()]
-    among = couplings_in_worlds(couplings, [magnets[k].world for k in coupled], ball_worlds)
+    among = couplings_in_worlds(couplings, [magnets[k].world for k in coupled], [True] * len(coupled), ball_worlds)
     coupling_of = dict(zip(coupled, among, strict=True))
     bodies: dict[int, list[DistantBody] | None] = {}
     result = {}
