@@ -24,23 +24,24 @@ from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
 WINDOW = 2.5, 3.5
-"""Distances at which boxes start to turn into balls and are balls, in means of their sizes: the longest side times the
-root of its ratio to the shortest, less for small cells. Dipoles lack the quadrupole of flat cells, and need more
-distance. With 4.5 and 6 the force between two discs of 40:2 mm has an error of 3 % in place of 5 %, and forces in a
-stack of five 6 to 10 % in place of 7 to 16 %. But then up to five times as many cells are in the lists."""
+"""Distances at which boxes start to turn into balls and are balls, in mean sizes of two boxes. The size of a box is its
+longest side times the root of its ratio to the shortest side, less for small cells. Dipoles lack the quadrupole of flat
+cells, and need more distance. With 4.5 and 6 the force between two discs of 40:2 mm has an error of 3 % in place of
+5 %, and forces in a stack of five 6 to 10 % in place of 7 to 16 %. But then up to five times as many cells are in the
+lists."""
 _OF_SHEETS = 1.5
 """Factor of the sizes of linear cells in sheets of one or two layers. The fields of their cells almost cancel, but not
 where the formulas change with the distance. Without the factor the operator of three sheets of 30 × 30 × 1 mm that lie
-on each other would have an eigenvalue of -0.0014, and forces in stacks of discs would be 1 to 2 % larger. If only
-the windows of close boxes were larger, it would be -0.0002; if only those of all boxes were, -0.0013."""
+on each other would have an eigenvalue of -0.0014, and forces in stacks of discs would be 1 to 2 % larger. If the factor
+applied to :data:`CLOSE` only, the eigenvalue would be -0.0002, and to :data:`WINDOW` only, -0.0013."""
 _FLATTEST = 3.0
 """Largest ratio of sides that increases a size, that of whole cells at automatic spacing. Flatter cells are parts that
 a surface cuts off, of little volume."""
 CLOSE = 1.75, 2.25
-"""Distances at which the average over close boxes turns into their quadrupoles, in means of their sizes, too. In means
-of their longest sides the operator of a stack of five sheets would have an eigenvalue of -0.0025."""
+"""Distances between which the average over close boxes turns into their quadrupoles, also in mean sizes. With distances
+in mean longest sides, the operator of a stack of five sheets would have an eigenvalue of -0.0025."""
 FINE = 1.2, 1.6
-"""Distances at which 4 × 4 × 2 points of a flat box turn into 2³, in means of longest sides. The demagnetizing factor
+"""Distances between which 4 × 4 × 2 points of a flat box turn into 2³, in mean longest sides. The demagnetizing factor
 between touching boxes twice as wide as high is 7 % too large with 2³ points. Cells beside a touching one are within 1.2
 sides. The force between two discs of 40:2 mm has an error of 3 %. With 0.9 and 1.2 it is 9 %, with 2.1 and 2.6 it is
 4 %. A pair with fine points takes four times as long as another close one."""
@@ -50,14 +51,15 @@ OVERLAP_DEMAGNETIZATION = 0.45
 """Demagnetizing factor added to a cell inside another body. Quadrature over intersecting boxes leaves eigenvalues of
 -0.13."""
 OVERLAP = 0.02, 0.5
-"""Shares of a cell's volume inside other bodies from which it gets some and all of it. Contacts share less."""
+"""Shares of a cell's volume inside other bodies at which the added factor starts and is complete. Cells of bodies in
+contact overlap less."""
 _LONGEST_LIST = 2048
 """Longest list of candidates. A face cell of a cube has 50 to 60, one in a stack of five sheets up to 500."""
 _LONGEST_CLOSE = 192
 """Largest number of close candidates of a cell whose differences act on other bodies."""
 _BALL_REACH = 2.1
-"""Half side of the box that stands for a ball in the windows, in longest half sides of the cells of its world: nearer
-than 2.7 to 3.5 sides the field of a ball differs between the halves of a cell."""
+"""Half side of the box that represents a ball in :data:`WINDOW`, in longest half sides of the cells of its world.
+Nearer than 2.7 to 3.5 sides the field of a ball differs between the halves of a cell."""
 _MOST_BALLS = 400
 """Largest number of balls near a cell: those at least as wide as a cell, packed densely on one side."""
 _SHORTEST_LIST = 64
@@ -65,11 +67,12 @@ _SHORTEST_LIST = 64
 _SAMPLES = 32
 """Points whose neighbors are counted for the length of the lists."""
 _MARGIN = 0.5
-"""Part of half its size that a cell may move before candidates are searched again."""
+"""Fraction of half its size that a cell may move before candidates are searched again."""
 LOCATE, CLEAR, SELECT, ARRANGE, ASSIGN, LINK, TABULATE, TAKE_BALLS, ADD_FIELD, ADD_FORCE, ADD_REACTION = range(11)
 """The passes, in order; as in ``cell_pairs.h``."""
 _MATRIX_ROWS, _DETAIL_ROWS, _POSE_ROWS, _REACTION_ROWS = 9, 27, 7, 8
-"""Numbers of the matrices of a pair, of a relative pose, and of a force and torque; as in ``cell_rows.h``."""
+"""Numbers stored for a pair: matrix of means, matrices of differences, relative pose, and force and torque; as in
+``cell_rows.h``."""
 _KINDS = 10
 """Kinds of candidates; as in ``cell_rows.h``."""
 _BINS = 256

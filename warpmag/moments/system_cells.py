@@ -19,7 +19,7 @@ class SystemCells:
 
     Args:
         layout: Worlds and bodies of the moments.
-        couplings: First moment and coupling of each body of a copy of the worlds.
+        couplings: First moment and coupling of each body in one copy of the worlds.
         closed_forms: First moments of bodies whose near field has a closed form, in place of corrections.
         rotatable: Nonzero for moments whose torque is evaluated, Warp array, shape [n].
         packed: All moments, packed (``kernels.pairs.packing.PackedMoments``).
@@ -28,7 +28,7 @@ class SystemCells:
         forces, torques: Forces [N] and torques [N·m] to add to, Warp arrays, shape [n].
 
     Attributes:
-        bodies: First moment of each body of all copies, and its coupling among the others of its world.
+        bodies: First moment of each body of all copies, and its coupling among the other bodies of its world.
         couplings: Corrections within the bodies.
         pairs: Corrections between different bodies; None where no world has several.
         rotations: Rotation of each body from its frame to the world's (x, y, z, w), shape [bodies]; the caller writes
@@ -61,11 +61,11 @@ class SystemCells:
 
     @property
     def crowded(self) -> wp.array | None:
-        """1 if some cells have too many near cells: they act as balls, or as uniform boxes, shape [1]."""
+        """1 if some cells have too many near cells; such cells act as balls or uniform boxes, shape [1]."""
         return None if self.pairs is None else self.pairs.crowded
 
     def average_sources(self, sources: AppliedForces):
-        """Let permanent bodies act on the cells near them by averages."""
+        """Average the fields of permanent bodies over the cells near them."""
         bodies: list[NearCellBody | None] = [None] * len(self._alone)
         for number, (first, coupling) in enumerate(self._alone):
             if self._takes_part[number]:

@@ -61,7 +61,7 @@ class Slopes:
     neighbor: np.ndarray  # neighbor of each cell on each side, the cell itself where there is none, shape [n, 6]
     weight: np.ndarray  # weights w of the neighbors, shape [n, 6]
     tensor: np.ndarray  # T_ij [1/m³] for the entries of the coupling, H_i += Σ T_ij m_j, shape [entries, 3, 3]
-    alone: np.ndarray  # change of the xx, yy and zz of T_ij where no other iron is near [1/m³], shape [entries, 3]
+    alone: np.ndarray  # added to xx, yy, zz of T_ij in a world without other iron [1/m³], shape [entries, 3]
 
 
 @dataclass(frozen=True)
@@ -100,11 +100,12 @@ class Coupling:
         return self.slopes is not None and bool((np.ptp(local, axis=0) < 1.5 * self.cell_sides).any())
 
     def among(self, bodies: int, *, balls: bool) -> "Coupling":
-        """Return the coupling in a world with a number of bodies of cells, itself included; one for all of a shape.
+        """Return the coupling in a world with a number of iron bodies of cells, this one included.
 
-        C replaces charges near edges. Where bodies touch there are none, so each gets C over the number of bodies. With
-        all of C the operator of a ring, whose flux is closed, would not be positive. ``balls`` says whether the world
-        has balls of iron. The slopes of the only iron of a world get the whole of what ``linear_cells.py`` subtracts.
+        C replaces charges near edges. Where bodies touch there are none, so C is divided by ``bodies``. With all of C
+        the operator of a closed ring of bodies would not be positive. ``balls`` is True if the world has iron balls.
+        For the only iron of a world the whole energy of the sawtooth is subtracted (``linear_cells.py``). Bodies that
+        share a coupling share the results.
         """
         if (bodies, balls) not in self._among:
             slopes = self.slopes
@@ -154,7 +155,7 @@ def couplings_in_worlds(
     Args:
         couplings: Coupling of each body of cells.
         worlds: World of each of these bodies.
-        iron: False for permanent magnets with recoil permeability, which hardly respond.
+        iron: False for permanent magnets with recoil permeability. They do not count, because they hardly respond.
         ball_worlds: Worlds with balls of iron.
     """
     count = Counter(world for world, is_iron in zip(worlds, iron, strict=True) if is_iron)

@@ -1,20 +1,21 @@
 """Charges on a flat face of iron that vary over less than a cell, and their response to a potential.
 
-Cells are uniformly magnetized, and so are the charges of their faces. In front of the edge of a magnet the charge of an
-iron face varies over less than a cell. Without that a magnet in contact pulls too little.
+Cells are uniformly magnetized, so the charges of their faces are uniform. In front of the edge of a magnet the charge
+of an iron face varies over less than a cell. Without this variation a magnet in contact pulls too weakly.
 
-A face gets charges q on equal squares besides. Those of an ideally permeable body keep its surface at one potential:
-S q + φ = const with the potentials S of uniformly charged squares. The magnetization of the cells has uniform charges,
-and keeps the average field of each cell near 0. So φ is the potential less that of the average field, and q = −R φ with
-R = Q (Qᵀ S Q)⁻¹ Qᵀ, where the columns of Q span all charges without a sum. The energy is −½ μ0 φᵀ R φ. A body of finite
-susceptibility χ responds by χ/(χ + 2) of that, as a half-space does. Charges of different faces do not act on each
-other: they fall off fast.
+A face therefore has additional charges q on equal squares. The charges of an ideally permeable body keep its surface at
+one potential: S q + φ = const with the potentials S of uniformly charged squares. The magnetization of the cells has
+uniform charges, and keeps the average field of each cell near 0. So φ is the potential minus that of the average field,
+and q = −R φ with R = Q (Qᵀ S Q)⁻¹ Qᵀ, where the columns of Q span all charges whose sum is 0. The energy is
+−½ μ0 φᵀ R φ. For a body of finite susceptibility χ, R is multiplied by χ/(χ + 2), as for a half-space. Charges of
+different faces do not act on each other, because their fields fall off fast.
 
 The part of q that varies linearly over a face is too large where the field is smooth. Over an ideal half-space a
-potential cos kx at the surface has the charges 2 k cos kx. Along a face of side l they vary by 2 k² l. The cells leave
-the potential a slope of k² d/2 of second order, since their average field is that at half their depth d, and R makes it
-charges that vary by k² d/(2 c) with c = 0.09. The ratio of both is 4 c l/d = 0.36 l/d. Edges of magnets need up to all
-of q. So the linear part of q along a side is multiplied by :data:`_LINEAR` l/d, at most 1.
+potential cos kx at the surface induces the charges 2 k cos kx. Along a face of side l they vary by up to 2 k² l. The
+average field of a cell is the field at half its depth d. After it is subtracted, φ has a slope of up to k² d/2, to
+second order in k. R turns this slope into charges that vary by k² d/(2 c) with c = 0.09. The exact charges are 4 c l/d
+= 0.36 l/d times these. Near edges of magnets, up to all of q is needed. So the linear part of q along a side is
+multiplied by :data:`_LINEAR` l/d, at most 1.
 """
 
 from functools import cache
@@ -24,19 +25,19 @@ import numpy as np
 from warpmag.shapes.uniform_response import potentials
 
 _LINEAR = 0.5
-"""Share of linear charges for cells that are cubes. For magnets over 10 mm of iron with 700 and 1,800 cells, in contact
-and at 1 mm, the errors are then −3 to +3 %. With a share of 0.36 they are −7 to +2 %, and with all linear charges +1 to
-+8 %."""
+"""Factor of the linear charges of cubic cells. For magnets over 10 mm of iron with 700 and 1,800 cells, in contact and
+at 1 mm, errors of the force are −3 to +3 %. With a factor of 0.36 they are −7 to +2 %, and with a factor of 1 they are
++1 to +8 %."""
 _GAUSS_POINTS = 3
 """Points along each side of a square, over which its potential is averaged."""
 
 
 @cache
 def face_response(sides: tuple[float, float, float], split: int) -> np.ndarray:
-    """Return the responses R [m] of the faces of a cuboid across x, y and z, shape [3, split², split²].
+    """Return the responses R [m] of a cuboid's faces normal to x, y and z, shape [3, split², split²].
 
-    ``sides`` are those of the cuboid [m]. A face has ``split`` squares along each side; the last axis of the
-    cuboid comes last.
+    ``sides`` are the sides of the cuboid [m]. A face has ``split`` rectangles along each side. Of the two axes of a
+    face the later one varies fastest.
 
     Example:
         >>> face_response((0.004, 0.004, 0.002), 4).shape

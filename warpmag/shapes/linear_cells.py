@@ -23,9 +23,10 @@ demagnetizing factor
 
     1 − tanh(p/2)/(p/2),    p = 4π t/l.
 
-Only this part of the energy is subtracted. With all of it the energy of a sheet could be negative, and the solve of a
-sheet of 60 × 60 × 0.1 mm on a plate would not converge. A body that is the only iron in its world has no such
-neighbors. It gets all of it, which is right within 2 % for a magnet over a plate of 1 mm instead of 3 %.
+Only this part of the energy is subtracted. If all of it were subtracted, the energy of a sheet could be negative, and
+the solve of a sheet of 60 × 60 × 0.1 mm on a plate would not converge. A body that is the only iron in its world has no
+neighboring sheets. For this body all of the energy is subtracted: the force of a magnet over a plate of 1 mm then has
+an error of at most 2 % instead of 3 %.
 
 Magnetizations without charges have no energy. In iron they do not occur, because M follows the curl-free field H. But
 conjugate gradients need many steps for them, and errors of distant pairs of cells would make their energy negative. So
@@ -77,9 +78,9 @@ def _cell_indices(part: Pieces) -> np.ndarray:
 
 
 def _neighbors(index: np.ndarray, volumes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return neighbors and weights; ``volumes`` are over that of a whole cell.
+    """Return neighbors and weights; ``volumes`` are relative to the volume of a whole cell.
 
-    Neighbors are mutual, and of two cells at one index the larger one has them.
+    Neighbors are mutual. Of two cells at one index only the larger one has neighbors.
     """
     cells = {}
     for i in np.argsort(volumes, kind="stable").tolist():
@@ -96,7 +97,7 @@ def _neighbors(index: np.ndarray, volumes: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 class _Operator:
-    """Operator of a body's linear cells less the pair law, symmetrized by the roots of volumes."""
+    """Operator of a body's linear cells minus the pair law, symmetrized by the roots of volumes."""
 
     def __init__(self, coupling, part: Pieces, index, volumes, neighbor, weight):
         """Compute the tensors of the coupling's entries in the frame of the grid."""
@@ -151,7 +152,7 @@ class _Operator:
         return (block + eye_array(n) / 3.0 if k == j else block).tocsr()
 
     def sawtooth(self, k: int) -> np.ndarray:
-        """Return the entries of the rest of the energy of the sawtooth along axis k, shape [entries]."""
+        """Return the entries of the sawtooth's energy along axis k that is not yet subtracted, shape [entries]."""
         slope = self._slopes[k]
         return self._left_sawtooth[k] * (slope.T @ slope).tocsr()[self.row, self.other]
 
@@ -196,8 +197,8 @@ def _within_half(index: np.ndarray, sides: np.ndarray) -> np.ndarray:
 def half_cell_tensors(offsets: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return demagnetizing tensors between the means and differences of cells, three arrays of shape [n, 3, 3].
 
-    They are of means by differences, of differences by means, and of differences by differences. ``offsets`` are the
-    vectors from sources to targets in ``sides``, whole numbers, shape [n, 3].
+    They map differences to mean fields, means to differences of fields, and differences to differences of fields.
+    ``offsets`` are the vectors from sources to targets in ``sides``, whole numbers, shape [n, 3].
     """
     steps = grid(np.array([3, 3, 3])).astype(int) - 1  # between an octant of the target and one of the source
     octants = np.asarray(offsets)[:, None] * 2 + steps
