@@ -26,9 +26,8 @@ from warpmag.kernels.shared.team import launch_passes, threads_for
 WINDOW = 2.5, 3.5
 """Distances at which boxes start to turn into balls and are balls, in mean sizes of two boxes. The size of a box is its
 longest side times the root of its ratio to the shortest side, less for small cells. Dipoles lack the quadrupole of flat
-cells, and need more distance. With 4.5 and 6 the force between two discs of 40:2 mm has an error of 3 % in place of
-5 %, and forces in a stack of five 6 to 10 % in place of 7 to 16 %. But then up to five times as many cells are in the
-lists."""
+cells, and need more distance. Without :data:`_OF_SHEETS` the force between two discs of 40:2 mm has an error of 5 %,
+and 3 % with 4.5 and 6. But then up to five times as many cells are in the lists."""
 _OF_SHEETS = 1.5
 """Factor of the sizes of linear cells in sheets of one or two layers. The fields of their cells almost cancel, but not
 where the formulas change with the distance. Without the factor the operator of three sheets of 30 × 30 × 1 mm that lie

@@ -25,8 +25,8 @@ demagnetizing factor
 
 Only this part of the energy is subtracted. If all of it were subtracted, the energy of a sheet could be negative, and
 the solve of a sheet of 60 × 60 × 0.1 mm on a plate would not converge. A body that is the only iron in its world has no
-neighboring sheets. For this body all of the energy is subtracted: the force of a magnet over a plate of 1 mm then has
-an error of at most 2 % instead of 3 %.
+neighboring sheets. For this body all of the energy is subtracted: the force of a magnet over 1 mm of iron then has an
+error of at most 2 % instead of 3 %.
 
 Magnetizations without charges have no energy. In iron they do not occur, because M follows the curl-free field H. But
 conjugate gradients need many steps for them, and errors of distant pairs of cells would make their energy negative. So
