@@ -332,8 +332,8 @@ def test_tables_rest_until_a_box_moves(device):
     pairs.request_search(wp.ones(1, dtype=int, device=device))
     assert changes_by_find()
     # a search on a GPU may arrange the rows in another order
-    found = np.sort(pairs.arrays.matrix.numpy(), axis=None)
-    np.testing.assert_allclose(found, np.sort(exact, axis=None), atol=1e-6 * np.abs(exact).max())
+    matrices = np.sort(pairs.arrays.matrix.numpy(), axis=None)
+    np.testing.assert_allclose(matrices, np.sort(exact, axis=None), atol=1e-6 * np.abs(exact).max())
 
 
 def test_pairs_that_leave_and_enter_the_window(device):
