@@ -152,17 +152,18 @@ def test_fine_cells_of_thick_iron_pull_right(gap, device):
     assert forces[1, 2] == pytest.approx(load()[name]["forces"][1][2], rel=0.05)
 
 
-def test_thin_plate_that_is_the_only_iron_pulls_right(device):
-    """The error is 1.7 %; it is 3.1 % beside other iron, where less of the sawtooth of its slopes is subtracted."""
-    name = "magnet μ 1 over iron plate 1, gap 1"
-    expected, magnet = load()[name]["forces"][1][2], SETUPS[name].bodies[1]
+@pytest.mark.parametrize("permeability", ["1", "1.05"])
+def test_thin_plate_that_is_the_only_iron_pulls_right(permeability, device):
+    """The error is 1.7 %. Beside a ball of iron it is 3.1 %: less of the sawtooth of the slopes is subtracted there.
+
+    A magnet with recoil permeability does not count as iron.
+    """
+    name = f"magnet μ {permeability} over iron plate 1, gap 1"
+    setup, expected = SETUPS[name], load()[name]["forces"][1][2]
     ball = Body("ball", (0.005,), (0.0, 0.0, 0.3))
-    errors = []
-    for setup in (SETUPS[name], replace(SETUPS[name], bodies=(*SETUPS[name].bodies, ball))):
-        assert setup.bodies[1] is magnet
-        forces, _, _ = iron.model_forces(setup, 0, device, "dipole")
-        errors.append(abs(forces[1, 2] / expected - 1.0))
-    assert errors[0] < 0.025 < errors[1] < 0.04
+    for bodies, limit in ((setup.bodies, 0.025), ((*setup.bodies, ball), 0.04)):
+        forces, _, _ = iron.model_forces(replace(setup, bodies=bodies), 0, device, "dipole")
+        assert forces[1, 2] == pytest.approx(expected, rel=limit)
 
 
 @pytest.mark.parametrize("depth", [0.0, 2e-6, 5e-5])

@@ -116,7 +116,7 @@ def cell_pairs_type(dtype):
         found_at: wp.array[vec3]  # positions at the last search [m], shape [n]
         moved: wp.array[int]  # 1 if a cell has moved too far since then, shape [1]
         searching: wp.array[int]  # nonzero if the last search rebuilt the lists, shape [1]
-        displaced: wp.array[int]  # 1 if a box differs from that of the last search, shape [1]
+        displaced: wp.array[int]  # 1 if a box has moved since the last call of ``find``, shape [1]
         rows: wp.array[int]  # number of rows, shape [1]
         bin: wp.array[int]  # bin of each moment by its numbers of candidates, −1 for no row, shape [n]
         bin_end: wp.array[int]  # end of each bin's rows, shape [BINS]

@@ -155,7 +155,8 @@ def couplings_in_worlds(
     Args:
         couplings: Coupling of each body of cells.
         worlds: World of each of these bodies.
-        iron: False for permanent magnets with recoil permeability. They do not count, because they hardly respond.
+        iron: False for permanent boxes and cylinders with recoil permeability. They do not count, because they hardly
+            respond.
         ball_worlds: Worlds with balls of iron.
     """
     count = Counter(world for world, is_iron in zip(worlds, iron, strict=True) if is_iron)

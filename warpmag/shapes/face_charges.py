@@ -64,6 +64,6 @@ def _rectangle_response(sides: np.ndarray, depth: float, split: int) -> np.ndarr
     other = np.linalg.svd(np.ones((len(unit), 1)))[0][:, 1:]
     response = other @ np.linalg.solve(other.T @ self_potential @ other, other.T)
     linear = unit / np.linalg.norm(unit, axis=0)
-    root = linear * (1.0 - np.sqrt(np.minimum(_LINEAR * sides / depth, 1.0))) @ linear.T
-    reduced = np.eye(split**2) - root
-    return reduced @ response @ reduced
+    removed = 1.0 - np.sqrt(np.minimum(_LINEAR * sides / depth, 1.0))
+    reduction = np.eye(split**2) - linear * removed @ linear.T
+    return reduction @ response @ reduction
