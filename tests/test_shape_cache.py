@@ -1,6 +1,8 @@
 """Files that keep sampled shapes between processes: hits, versions, damage, folders that cannot be written."""
 
+import gc
 import logging
+import warnings
 
 import newton
 import numpy as np
@@ -39,6 +41,15 @@ def test_other_keys_have_other_values(tmp_path, other):
     shapes = ShapeCache(tmp_path)
     assert shapes.get("", (1, b"ab"), lambda: "first") == "first"
     assert shapes.get("", other, lambda: "second") == "second"
+
+
+def test_the_list_of_files_is_closed_if_another_process_has_deleted_one(tmp_path):
+    (tmp_path / "deleted").symlink_to("nowhere")  # listed, without a status
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", ResourceWarning)
+        assert ShapeCache(tmp_path).get("", (), lambda: 1) == 1
+        gc.collect()
+    assert not caught
 
 
 def test_another_version_of_the_code_computes_again(tmp_path, monkeypatch):

@@ -94,7 +94,8 @@ class ShapeCache:
 
     def _delete_old(self) -> None:
         """Delete the least recently read files beyond :data:`MOST_BYTES`."""
-        files = [(entry.stat(), entry.path) for entry in os.scandir(self._folder)]
+        with os.scandir(self._folder) as entries:
+            files = [(entry.stat(), entry.path) for entry in entries]
         total = sum(status.st_size for status, _ in files)
         for status, path in sorted(files, key=lambda file: file[0].st_mtime):
             if total <= MOST_BYTES:
