@@ -191,6 +191,17 @@ def test_a_spline_is_refused_where_a_run_would_follow_it(tmp_path):
     ]
 
 
+@pytest.mark.parametrize("name", ["ampereTurns", "voltage"])
+def test_a_spline_of_a_coil_is_refused(tmp_path, name):
+    path = write(tmp_path, 'def Xform "Coil" (prepend apiSchemas = ["WarpmagCoilAPI"])\n{\n'
+                 "uniform float warpmag:coil:radius = 0.02\n"
+                 "uniform float warpmag:coil:turns = 10\nuniform float warpmag:coil:resistance = 1\n"
+                 f"float warpmag:coil:{name}.spline = {{\n0: 1,\n24: 2,\n}}\n}}\n", held_ball(1))  # fmt: skip
+    assert [str(error) for error in check(path).errors] == [
+        f"/World/Coil: warpmag:coil:{name} is a spline, which a run does not read: bake it into time samples"
+    ]
+
+
 def test_a_joint_to_a_keyed_body_follows_it(tmp_path, device):
     carrier = prim("Cube", "Carrier", (BODY, COLLIDER), "double size = 0.01", KINEMATIC,
                    operations(translate={0: (0, 0, 0), 24: (0.5, 0, 0)}))  # fmt: skip

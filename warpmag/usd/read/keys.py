@@ -69,6 +69,8 @@ class KeyReader:
         attribute = self.unfrozen.GetPrimAtPath(prim.GetPath()).GetAttribute(name)
         times = attribute.GetTimeSamples() if attribute else ()
         where = f"{prim.GetPath()}: {name}"
+        if attribute:
+            _check_no_spline(attribute, where)
         if len(times) < 2:
             return None
         return _keys(times, [read(f"{where} at time code {time:g}", _sample(attribute, time)) for time in times], where)
@@ -156,12 +158,17 @@ def _keys(times, values, where: str, interpolation: str = "linear") -> Keys:
     return keys
 
 
+def _check_no_spline(attribute: Usd.Attribute, where: str) -> None:
+    """Raise :class:`InputError` if an attribute is a spline, whose values are not keys; ``where`` names it."""
+    if attribute.HasSpline():
+        raise InputError(f"{where} is a spline, which a run does not read: bake it into time samples")
+
+
 def _operation(xform: UsdGeom.XformOp) -> Operation:
     """Return a transform operation with its keys; a constant one has a single key."""
     attribute = xform.GetAttr()
     where = f"{attribute.GetPrim().GetPath()}: {attribute.GetName()}"
-    if attribute.HasSpline():
-        raise InputError(f"{where} is a spline, which a run does not read: bake it into time samples")
+    _check_no_spline(attribute, where)
     token = UsdGeom.XformOp.GetOpTypeToken(xform.GetOpType())
     times = xform.GetTimeSamples()
     if times:
