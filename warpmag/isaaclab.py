@@ -39,8 +39,8 @@ from warpmag.errors import InputError
 class Magnets:
     """The magnets, coils and magnetometers of all environments.
 
-    Make it before the environment, or in ``_setup_scene`` before assets are cloned. It lives until the environment is
-    closed::
+    Create it before the environment, or in ``_setup_scene`` before assets are cloned. It exists until the environment
+    is closed::
 
         magnets = warpmag.isaaclab.Magnets(external_field=(0.0, 0.0, 0.0))
         magnets.add_inducible(body="*/Ball_*", material="mild-steel")
@@ -56,7 +56,7 @@ class Magnets:
     _of_simulation: ClassVar[WeakKeyDictionary] = WeakKeyDictionary()
 
     def __init__(self, **settings: Any):
-        """Register for the events of the physics; ``settings`` are those of :class:`warpmag.Magnetics`."""
+        """Register callbacks for physics events; ``settings`` are arguments of :class:`warpmag.Magnetics`."""
         self._settings, self._magnetics = settings, None
         self._declarations: list[Callable] = []
         self._coils: dict[str, tuple[str, dict[str, Any]]] = {}
@@ -174,10 +174,10 @@ class Magnets:
         targets[rows] = values.expand(rows.shape)
 
     def readings(self, magnetometer: str) -> torch.Tensor:
-        """Return the readings B [T] in the frames of the sensors at the end of the last step, a view.
+        """Return a view of the readings B [T] at the end of the last step, in the frames of the sensors.
 
         The shape is [environments, 3], or [environments, sensors, 3] where an environment has several sensors of this
-        name. Environments that were reset since then have their readings after :meth:`update`.
+        name. For environments that were reset since then call :meth:`update` first.
 
         Raises:
             InputError: No magnetometer has the name.
@@ -188,7 +188,7 @@ class Magnets:
         return values[:, 0] if values.shape[1] == 1 else values
 
     def reset(self, env_ids: Any = None) -> None:
-        """Start environments again, see :meth:`warpmag.Magnetics.reset`; call it in ``_reset_idx``.
+        """Reset the magnets of environments, see :meth:`warpmag.Magnetics.reset`; call it in ``_reset_idx``.
 
         Args:
             env_ids: Environments, as a tensor or a sequence of indices; by default all.

@@ -4,7 +4,7 @@ The functions are those of ``warpmag`` with JAX arrays in place of arrays. The t
 ``float32`` or ``float64``; other arrays are converted. The functions may be part of ``jax.jit``, ``jax.grad`` and
 ``jax.vmap``. Kernels read and write the memory of JAX's arrays on JAX's stream (``wp.jax_callable``). With ``device``,
 the Warp device that computes, arrays are copied through the host (``jax.pure_callback``). Gradients
-(``docs/howto/gradients.md``) are of reverse mode and have no gradients of their own.
+(``docs/howto/gradients.md``) are of reverse mode; there are no second derivatives.
 
 Example:
     >>> import jax
@@ -49,7 +49,8 @@ _PLACES = ("positions", "targets", "dipoles", "curve_fields")
 def h_field(positions, moments, targets=None, *, radii=None, target_radii=None, method="auto", rtol=None, device=None):
     """Return the field H [A/m] of moments, shape [t, 3]; see :func:`warpmag.h_field`.
 
-    Gradients by ``positions``, ``moments`` and ``targets``. Computes on the arrays' device, or on ``device``.
+    Has gradients with respect to ``positions``, ``moments`` and ``targets``. Computes on the arrays' device, or
+    on ``device``.
     """
     arrays = {"positions": positions, "moments": moments, "targets": targets}
     arrays |= {"radii": radii, "target_radii": target_radii}
@@ -61,7 +62,8 @@ def h_field(positions, moments, targets=None, *, radii=None, target_radii=None, 
 def wrench(positions, moments, *, radii=None, external_field=None, method="auto", rtol=None, device=None):
     """Return forces [N] and torques [N·m], shape [n, 3] each; see :func:`warpmag.wrench`.
 
-    Gradients by ``positions``, ``moments`` and ``external_field``. Computes on the arrays' device, or on ``device``.
+    Has gradients with respect to ``positions``, ``moments`` and ``external_field``. Computes on the arrays' device,
+    or on ``device``.
     """
     arrays = {"positions": positions, "moments": moments, "radii": radii, "external_field": external_field}
     call = _call("wrench", {"method": method, "rtol": rtol}, device)
@@ -107,7 +109,8 @@ def solve_induction(
 ) -> InductionArrays:  # fmt: skip
     """Return the magnetic equilibrium of inducible balls; see :func:`warpmag.solve_induction`.
 
-    Gradients by all arrays, with a relative error of about ``rtol``. Computes on the arrays' device, or on ``device``.
+    Has gradients with respect to all arrays, with a relative error of about ``rtol``. Computes on the arrays' device,
+    or on ``device``.
     """
     dipoles, dipole_moments = induction.permanent_dipoles(permanent)
     arrays = {"positions": positions, "radii": radii, "saturation": saturation, "susceptibility": susceptibility}

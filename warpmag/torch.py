@@ -2,7 +2,7 @@
 
 The functions are those of ``warpmag`` with tensors in place of arrays. Device and type are those of ``positions``,
 ``float32`` or ``float64``; other tensors are converted. Kernels read and write the tensors' memory on the current
-stream. Each call records its gradient (``docs/howto/gradients.md``), which has no gradient of its own.
+stream. Each call records its gradient (``docs/howto/gradients.md``). There are no second derivatives.
 
 Example:
     >>> import torch
@@ -38,7 +38,7 @@ _DTYPES = {torch.float32: ("float32", wp.float32, wp.vec3), torch.float64: ("flo
 def h_field(positions, moments, targets=None, *, radii=None, target_radii=None, method="auto", rtol=None):
     """Return the field H [A/m] of moments, shape [t, 3]; see :func:`warpmag.h_field`.
 
-    Gradients by ``positions``, ``moments`` and ``targets``.
+    Has gradients with respect to ``positions``, ``moments`` and ``targets``.
     """
     tensors = {"positions": positions, "moments": moments, "targets": targets}
     tensors |= {"radii": radii, "target_radii": target_radii}
@@ -53,7 +53,7 @@ def h_field(positions, moments, targets=None, *, radii=None, target_radii=None, 
 def wrench(positions, moments, *, radii=None, external_field=None, method="auto", rtol=None):
     """Return forces [N] and torques [N·m], shape [n, 3] each; see :func:`warpmag.wrench`.
 
-    Gradients by ``positions``, ``moments`` and ``external_field``.
+    Has gradients with respect to ``positions``, ``moments`` and ``external_field``.
     """
     tensors = {"positions": positions, "moments": moments, "radii": radii, "external_field": external_field}
 
@@ -102,8 +102,8 @@ def solve_induction(
 ) -> InductionTensors:  # fmt: skip
     """Return the magnetic equilibrium of inducible balls; see :func:`warpmag.solve_induction`.
 
-    Gradients by all arguments that are numbers but ``initial``, ``rtol`` and ``max_evaluations``. They have a relative
-    error of about ``rtol``.
+    Has gradients with respect to all arguments that are numbers, except ``initial``, ``rtol`` and ``max_evaluations``.
+    They have a relative error of about ``rtol``.
     """
     dipoles, dipole_moments = permanent_dipoles(permanent)
     tensors = {"positions": positions, "radii": radii, "saturation": saturation, "susceptibility": susceptibility}

@@ -188,10 +188,10 @@ def solve_induction(
         susceptibility: Susceptibility [dimensionless], scalar or [n], may be infinite.
         curve: Formula of the magnetization curve, ``tanh``, ``langevin``, ``clamped``, ``frohlich`` or
             ``tanh-applied``. Or a measured curve: a :class:`warpmag.MagnetizationCurve`, or the name of a material that
-            has one. Measured curves have their own saturation and susceptibility. A tuple or list of n gives each ball
-            its own curve.
+            has one. Measured curves have their own saturation and susceptibility. A tuple or list of n contains the
+            curve of each ball.
         curve_points: Points of a measured curve of all balls in place of ``curve``: (fields H inside [A/m],
-            magnetizations M [A/m]), each of shape [points], as :meth:`warpmag.MagnetizationCurve.from_mh`.
+            magnetizations M [A/m]), each of shape [points], as for :meth:`warpmag.MagnetizationCurve.from_mh`.
         external_field: Applied field H0 [A/m], shape [3] or [n, 3].
         permanent: Permanent point dipoles as (positions [m], moments [A·m²]), each of shape [k, 3].
         dynamics: ``theta``: accelerated exact flow of Eqs. 8 and 9. ``theta-euler``: their explicit step. ``llg``,
@@ -199,8 +199,8 @@ def solve_induction(
         contact_model: ``dipole``; ``multipole`` adds the higher multipoles of balls that nearly touch, from the exact
             solution of two balls (see ``warpmag.kernels.near_contact``). With ``dipole`` two balls in line with the
             field attract too weakly: by 34 % at a gap of 0.3 radii, by 93 % at 0.01.
-        method: Summation of fields: ``direct``, over all pairs; ``fmm``, the fast multipole method with errors that
-            ``rtol`` allows; ``auto``, the faster of the two.
+        method: Summation of fields: ``direct`` over all pairs, ``fmm`` by the fast multipole method with an error
+            within ``rtol``, or ``auto`` for the faster one.
         rtol: Relative error of the magnetizations at which the solve ends.
         max_evaluations: Field evaluations after which the solve ends unconverged.
         initial: Magnetizations to start from [A/m], shape [n, 3].

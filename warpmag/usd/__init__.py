@@ -1,8 +1,8 @@
 """Reads and writes USD: schemas of magnets, stages and their errors, and the cache of a run.
 
 Only this folder and ``show`` import ``pxr``. Importing this package registers the schemas of warpmag and Newton. Import
-it before a process opens the first stage, because USD takes no new schemas afterwards. warpmag reads its own attributes
-correctly even then. May import ``declarations``.
+it before a process opens the first stage, because USD takes no new schemas afterwards. If USD does not know the
+schemas, warpmag still reads its own attributes correctly. May import ``declarations``.
 """
 
 from warpmag.usd.schemas import author_magnet, author_settings, collider_magnet, magnet_of, shape_axis  # isort: skip  (registers the schemas first)

@@ -60,10 +60,9 @@ _TO_USD: dict[str, Callable[[Any], Any]] = {
 
 
 def author_magnet(prim: Usd.Prim, magnet: Magnet) -> None:
-    """Make ``prim`` a magnet and author its attributes: Newton reads authored values only, no fallbacks.
+    """Make ``prim`` a magnet and author its attributes, also default values, because Newton reads authored values only.
 
-    Attributes without effect on this magnet are left out: a recoil permeability of 1, a conductivity of 0, and
-    attributes that a measured curve sets.
+    A recoil permeability of 1, a conductivity of 0, and attributes that a measured curve sets are not authored.
     """
     check_prim(prim, authored=True)
     check_record("magnet", magnet, Magnet)

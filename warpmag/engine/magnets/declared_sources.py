@@ -62,14 +62,15 @@ def add_coil(
             1 % of the coil's radius, or of the diagonal of a polyline's bounding box.
         ampere_turns: Current times turns [A], all turns of a solenoid; :meth:`warpmag.Magnetics.set_current` changes
             it. For a coil with a resistance, the value at the start.
-        resistance: Resistance of the winding and its supply [Ω]. The current then follows from the voltage and from the
-            flux of iron, magnets and coils. By default the current is given.
+        resistance: Resistance of the winding and its supply [Ω]. The current then follows from the voltage, from the
+            flux of iron and magnets, and from that of coils that do not move relative to this one. By default the
+            current is given.
         voltage: Voltage [V] at a coil with a resistance; :meth:`warpmag.Magnetics.set_voltage` changes it. 0 is a
             short circuit.
         turns: Number of turns; a coil with a resistance needs it.
-        inductance: Inductance of a coil with a resistance, in air [H]. By default computed from the geometry:
-            all turns in the wire of a loop or a polyline, or in the sheet of a solenoid. The smallest valid value is a
-            hundredth of the computed one. If given inductances are too small for the computed mutual inductances, the
+        inductance: Inductance of a coil with a resistance, in air [H]. The default follows from the geometry, with all
+            turns in the wire of a loop or a polyline, or in the sheet of a solenoid. The smallest valid value is a
+            hundredth of this default. If given inductances are too small for the computed mutual inductances, the
             mutual inductances are reduced, so that the magnetic energy cannot be negative.
         xform: Pose of the coil in the frame of the body, or in the world.
         label: Label of the coil, by which :meth:`warpmag.Magnetics.set_current` finds it.

@@ -64,8 +64,8 @@ class Magnetics:
 
     Attributes:
         magnets: The magnets, in the order of their moments.
-        system: The moments on the device. Call its ``refresh`` before reading its ``positions`` and
-            ``moments``: a distant body may have acted by fewer moments, in another system. Probes and
+        system: The moments on the device. Call its ``refresh`` before reading its ``positions`` and ``moments``,
+            because in the last solve fewer moments, in another system, may have represented a distant body. Probes and
             :meth:`sum_moments` call it themselves.
         shapes: Indices of the magnetic shapes, in the order of :meth:`shape_moments`, shape [n].
         shape_volumes: Magnetic volume of each of these shapes [m³], shape [n]. Where shapes of one body overlap, the
@@ -313,7 +313,7 @@ class Magnetics:
         self._solve(state, dt, sharing)
 
     def _solve(self, state: newton.State, dt: float | None, sharing=None, *, taped: bool = False) -> None:
-        """Solve the induction, see :meth:`induce`; if ``taped``, with the moments that gradients know."""
+        """Solve the induction, see :meth:`induce`; ``taped`` excludes fewer moments for distant bodies."""
         values, system = self._values, self.system
         check_duration(dt, sharing, self._model.device)
         self._check_state(state, "body_q")
@@ -513,9 +513,9 @@ class Magnetics:
         """Return the time of each part of a step, and an estimate of it for each body and world.
 
         Parts of the last solve, such as neighbor search and field evaluations, are launched again on their own, on a
-        GPU in graphs. The time of a body is estimated from its share of moments, of pairs, and of near cells: cells on
-        which a permanent magnet nearby acts by averages. Bodies that act by fewer moments in all worlds are listed with
-        these moments. The last solve is kept. Waits for the device::
+        GPU in graphs. The time of a body is estimated from its share of moments, of pairs, and of near cells: cells so
+        close to a permanent magnet that its field is averaged over them. Bodies that fewer moments represent in all
+        worlds are listed with these moments. The result of the last solve does not change. Waits for the device::
 
             magnetics.apply(state)
             print(magnetics.workload())

@@ -20,7 +20,7 @@ class BodyLoad:
     world: int  # Newton world, -1 for none
     kind: str  # ``inducible`` or ``permanent``
     moments: int
-    near_cells: int  # cells that permanent magnets nearby act on by averages
+    near_cells: int  # cells so close to a permanent magnet that its field is averaged over them
     seconds: float  # estimated share of the time of a step [s]
 
 

@@ -31,8 +31,8 @@ def held_bodies(magnetics: Magnetics, solver: RigidSolver, sizes: BodySizes) -> 
 def find_held(pairs: np.ndarray, holders: np.ndarray, fixed: np.ndarray) -> np.ndarray:
     """Return True for each body that a magnet holds, from the bodies that touch, shape [n, 2].
 
-    A held body touches a holder, a permanent or fixed magnet. Or it touches a held body and no ground. Ground is a
-    fixed body without magnets.
+    A held body touches a holder, a permanent or fixed magnet. Or it touches a held body, and neither of them is on the
+    ground, a fixed body without magnets.
     """
 
     def neighbors(bodies: np.ndarray) -> np.ndarray:

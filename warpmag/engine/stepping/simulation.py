@@ -119,9 +119,9 @@ class Simulation:
                 ``on_substep``. If a capture fails, kernels are launched one by one; see :attr:`capture_failure`.
             visuals: Also import visual shapes that do not collide, for a viewer.
             on_substep: Function of a state and the length of a substep [s], called in each substep after the magnetic
-                forces: it adds its own to ``state.body_f``, or sets ``simulation.control``. A substep may be repeated,
-                so its effects must follow from the state. With ``graphs=True`` it may launch kernels only, since its
-                Python runs once.
+                forces: it adds other forces to ``state.body_f``, or sets ``simulation.control``. A substep may be
+                repeated, so the effects of the function must depend on the state only. With ``graphs=True`` the
+                function may launch kernels only, because its Python code runs once.
 
         Raises:
             InputError: The scene or an argument is invalid; the message names the prim or the argument.
@@ -277,7 +277,7 @@ class Simulation:
 
     @property
     def capture_failure(self) -> str:
-        """Reason why steps are launched from Python and not as a faster graph; empty for a graph."""
+        """Reason why kernels are launched one by one and not as a faster graph; empty if a step is a graph."""
         return self._stepper.capture_failure
 
     @property
@@ -349,7 +349,7 @@ class Simulation:
         survive an interruption.
 
         Args:
-            frames: Output frames after the first; by default the whole stage, else one second.
+            frames: Output frames after the first; by default all of the stage, or one second without a time range.
             output: USD file to write. Passive springs of a builder are not written, nor, with a warning, its joints of
                 several axes.
             copy_scene: Copy the scene beside the output instead of referencing it. A scene with unsaved edits is always

@@ -38,7 +38,8 @@ class Statistics:
         depth: Deepest penetration [m].
         final_overlap: Deepest penetration at the end over the thickness of the thinner body.
         rms_speed: Root mean square speed of the magnets at the end [m/s].
-        held: Bodies held by a permanent or fixed magnet at the end, see ``held_bodies``.
+        held: Bodies that touch a permanent or fixed magnet at the end, and bodies off the ground that touch it through
+            others off the ground.
         held_rms_speed: Root mean square speed of held bodies [m/s].
         held_median_speed: Median speed of held bodies [m/s]; below the RMS if single bodies slide without friction.
         farthest: Largest distance of a magnet from the mean initial position, in any frame [m].
