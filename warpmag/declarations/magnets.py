@@ -152,7 +152,8 @@ class Magnet:
     )] = 1.0  # fmt: skip
     moment_spacing: Annotated[float, Attribute(
         "momentSpacing", "float", "Moment Spacing",
-        "Distance between the moments that sample the magnet; 0 means one moment for a ball, automatic otherwise.",
+        "Distance between the moments that sample the magnet. 0 means one moment for a ball, and an automatic distance "
+        "for other bodies.",
         unit="distance", range="[0, inf)", check=check_not_negative,
     )] = 0.0  # fmt: skip
     conductivity: Annotated[float, Attribute(

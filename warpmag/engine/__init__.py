@@ -1,1 +1,1 @@
-"""Magnets in Newton: the only part of warpmag that imports ``newton``."""
+"""Magnets in Newton, in three rooms: ``magnets``, ``pile_xpbd`` and ``stepping``."""
