@@ -350,8 +350,8 @@ class Simulation:
 
         Args:
             frames: Output frames after the first; by default all of the stage, or one second without a time range.
-            output: USD file to write. Passive springs of a builder are not written, nor, with a warning, its joints of
-                several axes.
+            output: USD file to write. It lacks passive springs of a builder, and joints of several axes. A warning
+                names each of these joints.
             copy_scene: Copy the scene beside the output instead of referencing it. A scene with unsaved edits is always
                 copied.
             resume: Continue the run at the output, if there is one; scene and options must be the same. On a CPU the
