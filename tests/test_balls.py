@@ -165,13 +165,14 @@ def test_runs_of_moments_are_those_of_each_world_by_itself():
         assert layout.runs(wanted) == runs
 
 
-def _size_of(kind, scale, source):
-    """Half of the smallest dimension of a shape [m]."""
-    name = newton.GeoType(kind).name
+def _dimensions_of(kind, scale, source):
+    """Half of the dimensions of a shape [m], sorted."""
+    name, (a, b, c) = newton.GeoType(kind).name, scale
     if name in ("MESH", "CONVEX_MESH"):
-        return 0.5 * np.ptp(np.asarray(source.vertices) * scale, axis=0).min()
-    used = {"SPHERE": 1, "CAPSULE": 1, "CYLINDER": 2, "CONE": 2, "BOX": 3, "ELLIPSOID": 3}
-    return min(scale[: used[name]]) if name in used else np.inf
+        return sorted(0.5 * np.ptp(np.asarray(source.vertices) * scale, axis=0))
+    half = {"SPHERE": (a, a, a), "CAPSULE": (a, a, a + b), "CYLINDER": (a, a, b), "CONE": (a, a, b)}
+    half |= dict.fromkeys(("BOX", "ELLIPSOID"), (a, b, c))
+    return sorted(half.get(name, 3 * (np.inf,)))
 
 
 def test_sizes_of_bodies_are_those_of_their_shapes():
@@ -202,18 +203,22 @@ def test_sizes_of_bodies_are_those_of_their_shapes():
     model = builder.finalize(device="cpu")
     result = body_sizes(model)
     scales, middles = model.shape_scale.numpy(), model.shape_transform.numpy()[:, :3]
-    sizes = [_size_of(*entry) for entry in zip(model.shape_type.numpy(), scales, model.shape_source, strict=True)]
+    sizes = [_dimensions_of(*entry) for entry in zip(model.shape_type.numpy(), scales, model.shape_source, strict=True)]
     thickness, reach = np.full(model.body_count, np.inf), np.zeros(model.body_count)
+    force_length = thickness.copy()
     for shape, body in enumerate(model.shape_body.numpy()):
         kinematic = model.body_flags.numpy()[body] & newton.BodyFlags.KINEMATIC
         if body >= 0 and not kinematic and model.shape_flags.numpy()[shape] & newton.ShapeFlags.COLLIDE_SHAPES:
-            thickness[body] = min(thickness[body], sizes[shape])
+            small, middle, _ = sizes[shape]
+            thickness[body] = min(thickness[body], small)
+            force_length[body] = min(force_length[body], middle, np.prod(sizes[shape]) ** (1 / 3))
             far = np.linalg.norm(middles[shape].astype(float) - model.body_com.numpy()[body])
             radius = model.shape_collision_radius.numpy()[shape]
             if far > 1e-3 * radius or model.shape_type.numpy()[shape] != newton.GeoType.SPHERE:
                 reach[body] = max(reach[body], far + radius)
     np.testing.assert_array_equal(result.thickness, thickness)
     np.testing.assert_allclose(result.reach, reach, rtol=1e-6)  # single precision
+    np.testing.assert_allclose(result.force_length, force_length, rtol=1e-6)
     assert np.isfinite(thickness).sum() > 10 and model.shape_count > 40
 
 

@@ -18,7 +18,7 @@ class Rules:
     def __init__(self):
         self.level = self.done = self.attempts = self.regrown = 0
         self.overlap, self.pressed_before, self.halt = 0.0, np.inf, "no"
-        self.motion = 0.0  # in a substep of the first level
+        self.motion = 0.0  # in a substep of the first level, over the distance in which forces vary
         self.known = False  # the contacts of the present state
 
     @property
@@ -27,10 +27,10 @@ class Rules:
         fitting = [n for n in (2**k for k in range(self.level + 1)) if self.motion * n / 2**self.level <= SHARED_TRAVEL]
         return min(2**self.level, max([2, *fitting]))
 
-    def judge(self, travel, next_travel, long_travel, overlap, lost, fill):
+    def judge(self, travel, next_travel, long_travel, force_travel, overlap, lost, fill):
         """Returns what becomes of the attempt, and the record of a step that is done."""
         self.attempts += 1
-        motion = long_travel / 2 * 2**self.level
+        motion = force_travel / 2 * 2**self.level
         if fill > CAPACITY:
             self.halt = "overflow"
             return "halted", None
@@ -69,11 +69,12 @@ def machine(device):
     return machine
 
 
-def report(arrays, travel, next_travel, long_travel, overlap, lost, fill):
+def report(arrays, travel, next_travel, long_travel, force_travel, overlap, lost, fill):
     """Stand in for the monitor."""
     peaks, counts = arrays.peaks.numpy(), arrays.counts.numpy()
     assert (peaks == 0.0).all() and counts[monitor.COUNT_BAD_BODY] == monitor.NO_BODY
-    peaks[[monitor.PEAK_TRAVEL, monitor.PEAK_NEXT_TRAVEL, monitor.PEAK_LONG_TRAVEL]] = travel, next_travel, long_travel
+    peaks[[monitor.PEAK_TRAVEL, monitor.PEAK_NEXT_TRAVEL]] = travel, next_travel
+    peaks[[monitor.PEAK_LONG_TRAVEL, monitor.PEAK_FORCE_TRAVEL]] = long_travel, force_travel
     peaks[[monitor.PEAK_OVERLAP, monitor.PEAK_ERROR]] = overlap, 0.125
     counts[monitor.COUNT_EVALUATIONS], counts[monitor.COUNT_CAPACITIES] = 7, fill
     if lost:
@@ -101,7 +102,7 @@ def test_the_device_follows_the_rules(machine):
     arrays = machine.arrays
     rules, rng = Rules(), np.random.default_rng(7)
     seen, shared = set(), set()
-    for _ in range(300):
+    for _ in range(400):
         machine.begin_step()
         while machine.attempting.numpy()[0]:
             wanted = [machine.remaining[level].numpy()[0] for level in range(stepping.LEVELS)]
@@ -110,11 +111,12 @@ def test_the_device_follows_the_rules(machine):
             travel = np.float32(rng.choice([0.01, 0.08, 0.3], p=[0.65, 0.2, 0.15]))
             next_travel = np.float32(rng.choice([0.01, 0.08, 0.3], p=[0.65, 0.2, 0.15]))
             long_travel = np.float32(max(travel, next_travel) * rng.uniform(2.0, 4.0))  # 0.2 is the limit of easing
+            force_travel = np.float32(long_travel * rng.choice([0.03, 1.0], p=[0.15, 0.85]))  # of a sheet, of a ball
             overlap = np.float32(rng.choice([0.001, 0.005, 0.01, 0.02], p=[0.6, 0.2, 0.1, 0.1]))
             lost, fill = rng.random() < 0.05, int(rng.choice([50, CAPACITY, 101], p=[0.8, 0.15, 0.05]))
-            report(arrays, travel, next_travel, long_travel, overlap, lost, fill)
+            report(arrays, travel, next_travel, long_travel, force_travel, overlap, lost, fill)
             record_at = rules.done % 16
-            motion = (float(travel), float(next_travel), float(long_travel))
+            motion = (float(travel), float(next_travel), float(long_travel), float(force_travel))
             outcome, record = rules.judge(*motion, float(overlap), lost, fill)
             rules.known = outcome == "done"
             machine.end_attempt()
@@ -145,7 +147,7 @@ def test_the_device_follows_the_rules(machine):
 
 def test_time_is_counted_for_the_stage_that_it_was_spent_in(machine):
     arrays = machine.arrays
-    watched = machine.make_monitor(np.zeros(0), np.zeros(0))
+    watched = machine.make_monitor(np.zeros(0), np.zeros(0), np.zeros(0))
     machine.begin_step()
     work = wp.zeros(1 << 20, dtype=float, device=arrays.ticks.device)
     for _ in range(20):
@@ -181,7 +183,7 @@ def test_a_state_of_any_arrays_is_saved_and_restored(machine, device, flags):
         entry.zero_()
     machine.restore()  # nothing was rejected yet
     assert all(not entry.numpy().any() for entry in own)
-    report(machine.arrays, 2.0 * TRAVEL, 0.0, 0.0, 0.0, False, 0)
+    report(machine.arrays, 2.0 * TRAVEL, 0.0, 0.0, 0.0, 0.0, False, 0)
     machine.end_attempt()
     machine.restore()
     for entry, expected in zip(own, before, strict=True):
@@ -236,7 +238,7 @@ def test_what_tells_is_how_bodies_glide_along_each_other_where_they_touch(case, 
     model = builder.finalize(device=device)
     sizes = body_sizes(model)
     solver = RigidSolver(model, sizes)
-    watched = machine.make_monitor(sizes.thickness, sizes.reach)
+    watched = machine.make_monitor(sizes.thickness, sizes.force_length, sizes.reach)
     watched.fill_counts = wp.array(solver.fills(), dtype=wp.uint64, device=device)
     watched.counts = wp.zeros(monitor.COUNT_CAPACITIES + len(solver.buffers), dtype=wp.int32, device=device)
     machine.set_status(stepping.STATUS_LEVEL, level)
@@ -249,6 +251,7 @@ def test_what_tells_is_how_bodies_glide_along_each_other_where_they_touch(case, 
         other = monitor.PEAK_TRAVEL + monitor.PEAK_NEXT_TRAVEL - where
         assert peaks[where] == pytest.approx(here, rel=1e-3) and peaks[other] == 0.0
         assert peaks[monitor.PEAK_LONG_TRAVEL] == pytest.approx(2.0 * later, rel=1e-3)
+        assert peaks[monitor.PEAK_FORCE_TRAVEL] == peaks[monitor.PEAK_LONG_TRAVEL]  # of balls
         assert peaks[monitor.PEAK_DEPTH] == pytest.approx(max(0.0, -gap), abs=1e-6)
     assert watched.counts.numpy()[monitor.COUNT_CAPACITIES + 1] == 1  # contacts
 
@@ -261,7 +264,7 @@ def test_what_tells_is_how_far_forces_pull(level, machine, device):
     builder.add_body(is_kinematic=True)  # which forces do not move
     model = builder.finalize(device=device)
     sizes = body_sizes(model)
-    watched = machine.make_monitor(sizes.thickness, sizes.reach)
+    watched = machine.make_monitor(sizes.thickness, sizes.force_length, sizes.reach)
     machine.set_status(stepping.STATUS_LEVEL, level)
     state = model.state()
     forces = np.zeros((2, 6), dtype=np.float32)
@@ -272,3 +275,35 @@ def test_what_tells_is_how_far_forces_pull(level, machine, device):
     peaks = watched.peaks.numpy()
     assert peaks[monitor.PEAK_TRAVEL] == pytest.approx(pulled, rel=1e-5)
     assert peaks[monitor.PEAK_LONG_TRAVEL] == pytest.approx(4.0 * pulled, rel=1e-5)
+    assert peaks[monitor.PEAK_FORCE_TRAVEL] == peaks[monitor.PEAK_LONG_TRAVEL]  # of a ball
+
+
+@pytest.mark.parametrize("moves", ["alone", "along a plate", "by a force"])
+def test_a_sheet_may_move_by_more_than_its_thickness_while_forces_are_shared(moves, machine, device):
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    plate = builder.add_shape_box(-1, hx=2.0, hy=2.0, hz=0.5, xform=wp.transform((0.0, 0.0, -0.5), wp.quat_identity()))
+    sheet = builder.add_body(xform=wp.transform((0.0, 0.0, 0.0095), wp.quat_identity()))
+    builder.add_shape_box(sheet, hx=1.0, hy=0.8, hz=0.01)
+    builder.shape_flags[plate] = int(newton.ShapeFlags.COLLIDE_SHAPES) if moves == "along a plate" else 0
+    if moves != "by a force":
+        builder.body_qd[sheet] = (0.2, 0.0, 0.0, 0.0, 0.0, 0.0)
+    model = builder.finalize(device=device)
+    sizes = body_sizes(model)
+    watched = machine.make_monitor(sizes.thickness, sizes.force_length, sizes.reach)
+    state = model.state()
+    if moves == "by a force":
+        forces = np.zeros((1, 6), dtype=np.float32)
+        forces[0, 2] = 4.0 * model.body_mass.numpy()[0]
+        state.body_f.assign(forces)
+        monitor.watch_forces(watched, view_bodies(model, state), model.gravity, 0.1)
+        moved = 4.0 * 0.5 * 4.0 * 0.1**2  # 4 m/s² in twice 0.1 s
+    else:
+        solver = RigidSolver(model, sizes)
+        watched.fill_counts = wp.array(solver.fills(), dtype=wp.uint64, device=device)
+        watched.counts = wp.zeros(monitor.COUNT_CAPACITIES + len(solver.buffers), dtype=wp.int32, device=device)
+        solver.collide(state, 0.1)
+        solver.watch(watched, state, substep=1, longest=0.1, threshold=0.0)
+        moved = 2.0 * 0.2 * 0.1 * (WEIGHT if moves == "alone" else 1.0)
+    peaks = watched.peaks.numpy()
+    assert peaks[monitor.PEAK_LONG_TRAVEL] == pytest.approx(moved / 0.01, rel=1e-3)
+    assert peaks[monitor.PEAK_FORCE_TRAVEL] == pytest.approx(moved / (1.0 * 0.8 * 0.01) ** (1 / 3), rel=1e-3)

@@ -15,6 +15,9 @@ have limited in the last substep.
 **Displacement by forces** within a substep counts, too. Where contacts hold the body, the solver has to undo it, and
 the remainder heats a pile. In Sakura Tree, balls are held under 1,500 times their weight. After 0.6 s they move at
 9 cm/s with substeps of 0.5 ms, and at 2 cm/s with 0.25 ms.
+
+**Forces** are shared by substeps as long as bodies move little compared with the distance over which their magnetic
+forces vary. In a sheet this distance is much longer than the thickness, by which contacts judge.
 """
 
 import warp as wp
@@ -26,11 +29,12 @@ wp.set_module_options({"enable_backward": False})
 PEAK_TRAVEL = 0  # weighted motion in a substep, over the thickness of the thinner body [1]
 PEAK_NEXT_TRAVEL = 1  # the same, predicted for the substep after the attempt
 PEAK_LONG_TRAVEL = 2  # the largest of both, for substeps of twice the length
-PEAK_SPEED = 3  # speed of a body's center of mass [m/s]
-PEAK_OVERLAP = 4  # penetration over the thickness of the thinner body [1]
-PEAK_DEPTH = 5  # penetration [m]
-PEAK_ERROR = 6  # magnetization error [1]
-PEAKS = 7
+PEAK_FORCE_TRAVEL = 3  # the same over the distance in which magnetic forces vary, in place of the thickness [1]
+PEAK_SPEED = 4  # speed of a body's center of mass [m/s]
+PEAK_OVERLAP = 5  # penetration over the thickness of the thinner body [1]
+PEAK_DEPTH = 6  # penetration [m]
+PEAK_ERROR = 7  # magnetization error [1]
+PEAKS = 8
 
 COUNT_BAD_BODY = 0  # first body whose state was not finite, see ``watch``; else NO_BODY
 COUNT_EVALUATIONS = 1  # field evaluations, summed over solves
@@ -57,6 +61,7 @@ class Monitor:
     # Distance that a body may move before it can pass through another [m], the radius of a ball; infinite for bodies
     # that forces do not move. Shape [body_count].
     thickness: wp.array[float]
+    force_length: wp.array[float]  # distance over which the magnetic force on a body varies [m]; infinite as above
     reach: wp.array[float]  # largest displacement of a body's surface per radian [m], zero for a ball, [body_count]
     fill_counts: wp.array[wp.uint64]  # addresses of each buffer's number of used entries; 0 for :func:`watch_flags`
     level: wp.array[wp.int32]  # number of times that substeps were halved, shape [1]
@@ -99,9 +104,11 @@ def _raise_maximum(peaks: wp.array[float], index: int, value: float):
 
 
 @wp.func
-def _raise_travel(m: Monitor, travel: float, long_travel: float, substep: int):
+def _raise_travel(m: Monitor, travel: float, long_travel: float, length_ratio: float, substep: int):
+    """Raise the peaks of motion; ``length_ratio`` is the thickness over the distance in which forces vary."""
     _raise_maximum(m.peaks, wp.where(substep == NEXT_SUBSTEP, PEAK_NEXT_TRAVEL, PEAK_TRAVEL), travel)
     _raise_maximum(m.peaks, PEAK_LONG_TRAVEL, long_travel)
+    _raise_maximum(m.peaks, PEAK_FORCE_TRAVEL, length_ratio * long_travel)
 
 
 @wp.func
@@ -120,15 +127,15 @@ def _watch_body(m: Monitor, bodies: BodyView, body: int, substep: int, dt: float
         speed = wp.length(wp.spatial_top(bodies.qd[body]))
         turning = m.reach[body] * wp.length(wp.spatial_bottom(bodies.qd[body]))
         travel = UNCONSTRAINED_WEIGHT * (speed + turning) * dt / thickness
-        _raise_travel(m, travel, 2.0 * travel, substep)
+        _raise_travel(m, travel, 2.0 * travel, thickness / m.force_length[body], substep)
         _raise_maximum(m.peaks, PEAK_SPEED, speed)
 
 
 @wp.func
-def _body_thickness(m: Monitor, body: int) -> float:
+def _body_length(lengths: wp.array[float], body: int) -> float:
     if body < 0:
         return wp.inf
-    return m.thickness[body]
+    return lengths[body]
 
 
 @wp.func
@@ -152,7 +159,7 @@ def _watch_contact(
     """Raise the peaks by a contact's depth, and by the sliding of its bodies where it closes."""
     overlaps[i] = -wp.inf
     body0, body1 = contact_bodies(contacts, i)
-    thickness = wp.min(_body_thickness(m, body0), _body_thickness(m, body1))
+    thickness = wp.min(_body_length(m.thickness, body0), _body_length(m.thickness, body1))
     if thickness == wp.inf:
         return
     depth = contact_depth(contacts, bodies.q, i)
@@ -166,7 +173,8 @@ def _watch_contact(
     apart = wp.dot(contacts.normal[i], moved)
     along = wp.length(moved - apart * contacts.normal[i])
     closes, closes_later = apart < overlap, 2.0 * apart < overlap
-    _raise_travel(m, wp.where(closes, along, 0.0), wp.where(closes_later, 2.0 * along, 0.0), substep)
+    ratio = thickness / wp.min(_body_length(m.force_length, body0), _body_length(m.force_length, body1))
+    _raise_travel(m, wp.where(closes, along, 0.0), wp.where(closes_later, 2.0 * along, 0.0), ratio, substep)
 
 
 @wp.kernel
@@ -225,6 +233,7 @@ def _watch_forces(m: Monitor, bodies: BodyView, gravity_in: wp.array[wp.vec3], l
             pull = 0.5 * acceleration * dt * dt / thickness
             _raise_maximum(m.peaks, PEAK_TRAVEL, pull)
             _raise_maximum(m.peaks, PEAK_LONG_TRAVEL, 4.0 * pull)
+            _raise_maximum(m.peaks, PEAK_FORCE_TRAVEL, 4.0 * pull * thickness / m.force_length[body])
 
 
 def watch_forces(m: Monitor, bodies: BodyView, gravity, longest: float):

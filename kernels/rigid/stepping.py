@@ -9,7 +9,8 @@ Substeps are launched in pairs. Beyond the first level, several substeps share t
 length of a substep of the first level. Short substeps serve contacts between fast or strongly pressed bodies, and
 forces vary more slowly. Shared forces are evaluated halfway between the poses at which the first and the last of these
 substeps start, predicted from velocities. So they neither lag nor lead. Two substeps always share forces. More share
-them, up to the length of one of the first level, while the motion of the last attempt keeps their poses close.
+them, up to the length of one of the first level, where the motion of the last attempt is small compared with the
+distance over which magnetic forces vary.
 """
 
 import numpy as np
@@ -64,7 +65,7 @@ class StepArrays:
     log: wp.array2d[wp.float64]  # ring buffer with a record of each step, see ``LOG_*``, shape [records, LOG_FIELDS]
     capacities: wp.array[wp.int32]  # size of each monitored buffer
     travel: float  # limit of the motion in a substep over a body's thickness
-    shared_travel: float  # limit of that motion while more than two substeps share forces
+    shared_travel: float  # limit of the motion over ``force_length`` while more than two substeps share forces
     overlap: float  # limit of a new penetration over the thickness of the thinner body
     growth_margin: float  # substeps double in length if the predicted motion stays below this fraction of ``travel``
     futile_ratio: float  # substeps are not shortened further if they leave more than this fraction of a penetration
@@ -164,10 +165,10 @@ def _write_time(a: StepArrays, step: wp.float64, longest: wp.float64, time_out: 
 
 
 @wp.func
-def _sharing_substeps(level: int, long_travel: float, travel_level: int, limit: float) -> int:
+def _sharing_substeps(level: int, force_travel: float, travel_level: int, limit: float) -> int:
     """Return the number of substeps of ``level`` that share forces, from the motion in two of ``travel_level``."""
     count = 1 << level
-    travel = 0.5 * long_travel * float(1 << travel_level)
+    travel = 0.5 * force_travel * float(1 << travel_level)
     while count > 2 and not travel <= limit:
         count /= 2
         travel *= 0.5
@@ -206,14 +207,14 @@ def _end_attempt(a: StepArrays):
             return
     level = a.status[STATUS_LEVEL]
     overlap = a.peaks[monitor.PEAK_OVERLAP]
-    long_travel = a.peaks[monitor.PEAK_LONG_TRAVEL]
+    long_travel, force_travel = a.peaks[monitor.PEAK_LONG_TRAVEL], a.peaks[monitor.PEAK_FORCE_TRAVEL]
     is_deeper = overlap > wp.max(a.overlap, a.last_overlap[0])
     # shorter substeps reduce a penetration by fast bodies, but not one by a contact whose normal has changed
     improves = overlap < a.futile_ratio * a.last_overlap[1]
     not_finite = a.counts[monitor.COUNT_BAD_BODY] != monitor.NO_BODY
     if (a.peaks[monitor.PEAK_TRAVEL] > a.travel or (is_deeper and improves) or not_finite) and level + 1 < LEVELS:
         a.status[STATUS_LEVEL] = level + 1
-        a.status[STATUS_SHARING] = _sharing_substeps(level + 1, long_travel, level, a.shared_travel)
+        a.status[STATUS_SHARING] = _sharing_substeps(level + 1, force_travel, level, a.shared_travel)
         if is_deeper:
             a.last_overlap[1] = overlap
         _begin_attempt(a)
@@ -234,7 +235,7 @@ def _end_attempt(a: StepArrays):
     elif may_grow and long_travel < a.growth_margin * a.travel and level > 0:
         next_level = level - 1
     a.status[STATUS_LEVEL] = next_level
-    a.status[STATUS_SHARING] = _sharing_substeps(next_level, long_travel, level, a.shared_travel)
+    a.status[STATUS_SHARING] = _sharing_substeps(next_level, force_travel, level, a.shared_travel)
 
 
 @wp.kernel
@@ -279,10 +280,12 @@ class StepMachine:
         self.sharing = a.status[STATUS_SHARING : STATUS_SHARING + 1]
         self.invalidate_contacts()
 
-    def make_monitor(self, thickness, reach) -> monitor.Monitor:
+    def make_monitor(self, thickness, force_length, reach) -> monitor.Monitor:
         """Return the arrays of the monitor, for bodies of these sizes [m], shape [body_count]."""
         a, m = self.arrays, monitor.Monitor()
-        m.thickness, m.reach = (wp.array(values, dtype=float, device=a.status.device) for values in (thickness, reach))
+        m.thickness, m.force_length, m.reach = (
+            wp.array(values, dtype=float, device=a.status.device) for values in (thickness, force_length, reach)
+        )
         m.fill_counts = wp.zeros(len(a.capacities), dtype=wp.uint64, device=a.status.device)
         m.level = a.status[STATUS_LEVEL : STATUS_LEVEL + 1]
         m.substeps = a.status[STATUS_SUBSTEPS : STATUS_SUBSTEPS + 1]

@@ -41,11 +41,15 @@ class BodySizes:
     Attributes:
         thickness: Half of the smallest dimension of the body's colliding shapes, for a ball its radius. Infinite for
             bodies that forces do not move.
+        force_length: Distance over which the magnetic force on the body varies, for a ball its radius: for the shape
+            with the smallest one, the geometric mean of half its dimensions, or half its middle dimension if that is
+            less. In sheets it is longer than the thickness, in bars and nails hardly. Infinite as above.
         reach: Distance from the center of mass to the farthest point of a colliding shape, zero for a ball around its
             center of mass.
     """
 
     thickness: np.ndarray
+    force_length: np.ndarray
     reach: np.ndarray
 
 
@@ -53,35 +57,40 @@ def body_sizes(model: newton.Model) -> BodySizes:
     """Return the sizes of the bodies of ``model``, from their colliding shapes."""
     shape_body: np.ndarray = model.shape_body.numpy()
     types, scales, radii = model.shape_type.numpy(), model.shape_scale.numpy(), model.shape_collision_radius.numpy()
-    thickness, reach = np.full(model.body_count, np.inf), np.zeros(model.body_count)
+    thickness, force_length = np.full((2, model.body_count), np.inf)
+    reach = np.zeros(model.body_count)
     moving = model.body_inv_mass.numpy() > 0.0
     moving &= (model.body_flags.numpy() & newton.BodyFlags.KINEMATIC) == 0
     centers, frames = model.body_com.numpy(), model.shape_transform.numpy()
     shapes = np.flatnonzero((shape_body >= 0) & are_colliding(model))
     shapes = shapes[moving[shape_body[shapes]]]
     bodies = shape_body[shapes]
-    np.minimum.at(thickness, bodies, _thicknesses(types, scales, model.shape_source[: model.shape_count])[shapes])
+    dimensions = _half_dimensions(types, scales, model.shape_source[: model.shape_count])[shapes]
+    np.minimum.at(thickness, bodies, dimensions[:, 0])
+    # the cube root of each, because the product of tiny ones is 0
+    np.minimum.at(force_length, bodies, np.minimum(dimensions[:, 1], np.prod(np.cbrt(dimensions), axis=1)))
     arms = np.linalg.norm(frames[shapes, :3] - centers[bodies], axis=1)
     reaching = (arms > 1e-3 * radii[shapes]) | (types[shapes] != newton.GeoType.SPHERE)
     np.maximum.at(reach, bodies[reaching], (arms + radii[shapes])[reaching])
-    return BodySizes(thickness, reach)
+    return BodySizes(thickness, force_length, reach)
 
 
-def _thicknesses(types: np.ndarray, scales: np.ndarray, sources: list) -> np.ndarray:
-    """Return half of the smallest dimension [m] of each shape, infinite for planes and height fields, shape [n]."""
+def _half_dimensions(types: np.ndarray, scales: np.ndarray, sources: list) -> np.ndarray:
+    """Return half of the dimensions [m] of each shape from the smallest on, infinite for planes, shape [n, 3]."""
     kinds = newton.GeoType
-    thickness = np.full(len(types), np.inf)
+    half = np.full((len(types), 3), np.inf)
     for sized_kinds, columns in (
-        ((kinds.SPHERE, kinds.CAPSULE), 1),
-        ((kinds.CYLINDER, kinds.CONE), 2),
-        ((kinds.BOX, kinds.ELLIPSOID), 3),
+        ((kinds.SPHERE,), [0, 0, 0]),
+        ((kinds.CYLINDER, kinds.CONE), [0, 0, 1]),
+        ((kinds.BOX, kinds.ELLIPSOID), [0, 1, 2]),
     ):
         selected = np.isin(types, sized_kinds)
-        thickness[selected] = scales[selected, :columns].min(axis=1)
+        half[selected] = scales[selected][:, columns]
+    capsules = types == kinds.CAPSULE
+    half[capsules] = scales[capsules, :1] + scales[capsules, 1:2] * [0.0, 0.0, 1.0]
     for shape in np.flatnonzero(np.isin(types, (kinds.MESH, kinds.CONVEX_MESH))).tolist():
-        vertices = np.asarray(sources[shape].vertices) * scales[shape]
-        thickness[shape] = 0.5 * np.ptp(vertices, axis=0).min()
-    return thickness
+        half[shape] = 0.5 * np.ptp(np.asarray(sources[shape].vertices) * scales[shape], axis=0)
+    return np.sort(half, axis=1)
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,8 @@ TRAVEL_LIMIT = 0.25
 """Largest sliding along another body, or displacement by forces, in a substep, over the body's thickness; see
 ``kernels.rigid.monitor``."""
 _SHARED_TRAVEL_LIMIT = 0.5
-"""The same limit while more than two substeps share their forces. A free ball then moves at most two radii."""
+"""The same limit while more than two substeps share their forces, over the distance in which forces on the body vary. A
+free ball then moves at most two radii."""
 OVERLAP_LIMIT = 0.008
 """Largest new penetration in a step over the thickness of the thinner body."""
 _GROWTH_MARGIN = 0.8
@@ -114,7 +115,7 @@ class Stepper:
             _arrays(self._state) + currents, _arrays(self._saved) + [wp.clone(array) for array in currents]
         )
         self._arrays = self._machine.arrays
-        self._watched = self._machine.make_monitor(sizes.thickness, sizes.reach)
+        self._watched = self._machine.make_monitor(sizes.thickness, sizes.force_length, sizes.reach)
         self._mirrors = {name: getattr(self._arrays, name) for name in ("status", "peaks", "counts", "log")}
         if self._device.is_cuda:
             copies = {name: wp.empty_like(array, device="cpu", pinned=True) for name, array in self._mirrors.items()}
