@@ -38,7 +38,8 @@ class Rules:
         helped = overlap < FUTILE * self.pressed_before
         if (travel > TRAVEL or (pressed and helped) or lost) and self.level < stepping.LEVELS - 1:
             self.motion = motion
-            self.level += 1
+            needed = 1 + sum(travel > 4**k * TRAVEL for k in range(1, stepping.LEVELS))
+            self.level = min(self.level + needed, stepping.LEVELS - 1)
             self.pressed_before = overlap if pressed else self.pressed_before
             return "again", None
         if lost:
@@ -108,8 +109,8 @@ def test_the_device_follows_the_rules(machine):
             wanted = [machine.remaining[level].numpy()[0] for level in range(stepping.LEVELS)]
             assert wanted == [level == rules.level for level in range(stepping.LEVELS)]
             run_attempt(machine, rules, shared)
-            travel = np.float32(rng.choice([0.01, 0.08, 0.3], p=[0.65, 0.2, 0.15]))
-            next_travel = np.float32(rng.choice([0.01, 0.08, 0.3], p=[0.65, 0.2, 0.15]))
+            travel = np.float32(rng.choice([0.01, 0.08, 0.3, 2.0, 9.0], p=[0.65, 0.2, 0.11, 0.03, 0.01]))
+            next_travel = np.float32(rng.choice([0.01, 0.08, 0.3, 2.0, 9.0], p=[0.65, 0.2, 0.11, 0.03, 0.01]))
             long_travel = np.float32(max(travel, next_travel) * rng.uniform(2.0, 4.0))  # 0.2 is the limit of easing
             force_travel = np.float32(long_travel * rng.choice([0.03, 1.0], p=[0.15, 0.85]))  # of a sheet, of a ball
             overlap = np.float32(rng.choice([0.001, 0.005, 0.01, 0.02], p=[0.6, 0.2, 0.1, 0.1]))

@@ -2,7 +2,7 @@
 
 A step is attempted in substeps of one of ``LEVELS`` lengths, each half as long as that of the level before. By the
 results of the ``monitor``, the step is accepted and logged. Otherwise the state is restored, and the step is attempted
-at the next level. If a buffer was too small or a state was not finite, stepping halts. While halted, steps do nothing,
+at the next level, or a later one if motion is many times its limit. If a buffer was too small or a state was not finite, stepping halts. While halted, steps do nothing,
 so that the host can read the status at any time and continue from there.
 
 Substeps are launched in pairs. Beyond the first level, several substeps share their magnetic forces, for at most the
@@ -176,6 +176,21 @@ def _sharing_substeps(level: int, force_travel: float, travel_level: int, limit:
 
 
 @wp.func
+def _needed_halvings(excess: float) -> int:
+    """Return how often substeps are halved if motion is ``excess`` times its limit: never more than needed.
+
+    A displacement by forces falls to a quarter when substeps are halved, other motion to half.
+    """
+    halvings = int(1)
+    rest = float(excess)
+    for _ in range(LEVELS):
+        if rest > 4.0:
+            halvings += 1
+            rest *= 0.25
+    return halvings
+
+
+@wp.func
 def _log_step(a: StepArrays, level: int):
     """Write the record of a step that was completed at ``level``."""
     record = a.status[STATUS_DONE] % a.log.shape[0]
@@ -213,8 +228,9 @@ def _end_attempt(a: StepArrays):
     improves = overlap < a.futile_ratio * a.last_overlap[1]
     not_finite = a.counts[monitor.COUNT_BAD_BODY] != monitor.NO_BODY
     if (a.peaks[monitor.PEAK_TRAVEL] > a.travel or (is_deeper and improves) or not_finite) and level + 1 < LEVELS:
-        a.status[STATUS_LEVEL] = level + 1
-        a.status[STATUS_SHARING] = _sharing_substeps(level + 1, force_travel, level, a.shared_travel)
+        next_level = wp.min(level + _needed_halvings(a.peaks[monitor.PEAK_TRAVEL] / a.travel), LEVELS - 1)
+        a.status[STATUS_LEVEL] = next_level
+        a.status[STATUS_SHARING] = _sharing_substeps(next_level, force_travel, level, a.shared_travel)
         if is_deeper:
             a.last_overlap[1] = overlap
         _begin_attempt(a)
@@ -229,7 +245,7 @@ def _end_attempt(a: StepArrays):
     a.last_overlap[1] = wp.inf
     _log_step(a, level)
     may_grow = overlap < 0.5 * a.overlap or (is_deeper and not improves)
-    next_level = int(level)
+    next_level = level
     if a.peaks[monitor.PEAK_NEXT_TRAVEL] > a.travel:
         next_level = wp.min(level + 1, LEVELS - 1)
     elif may_grow and long_travel < a.growth_margin * a.travel and level > 0:
