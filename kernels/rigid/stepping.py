@@ -2,8 +2,9 @@
 
 A step is attempted in substeps of one of ``LEVELS`` lengths, each half as long as that of the level before. By the
 results of the ``monitor``, the step is accepted and logged. Otherwise the state is restored, and the step is attempted
-at the next level, or a later one if motion is many times its limit. If a buffer was too small or a state was not finite, stepping halts. While halted, steps do nothing,
-so that the host can read the status at any time and continue from there.
+at the next level, or a later one if motion is many times its limit. If a buffer was too small or a state was not
+finite, stepping halts. While halted, steps do nothing, so that the host can read the status at any time and continue
+from there.
 
 Substeps are launched in pairs. Beyond the first level, several substeps share their magnetic forces, for at most the
 length of a substep of the first level. Short substeps serve contacts between fast or strongly pressed bodies, and
