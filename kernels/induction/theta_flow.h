@@ -155,10 +155,10 @@ template <class State> CUDA_CALLABLE inline Number step_of(const State& state, c
 // any arrangement, and are short only where balls overlap.
 template <class State> CUDA_CALLABLE inline Number total_overlap(const State& state, const Span& at) {
     const Real* const labels = entries(state.packed, at, 7) - at.i;
-    const Real* const within = (const Real*)state.within_body.data;
+    const Mask within_body = mask_of(numbers_or(entries(state.within_body, at), at.count, 1) > Real(0));
     auto others = [=](Index i, Index j) {
         const Mask same = mask_of(collect(labels, i) == collect(labels, j));
-        return !same || (mask_of(collect(within, i) > Real(0)) && mask_of(j != i));
+        return !same || (within_body && mask_of(j != i));
     };
     return shared_volumes(state, at.i, at.count, at.begin, at.end, others);
 }
