@@ -115,6 +115,17 @@ def test_farther_than_single_precision_reaches(device):
         warpmag.Simulation(builder, device=device)
 
 
+def test_sheets_where_their_cells_would_overlap_at_random(device):
+    """At 1 km positions are 0.061 mm apart: a solve of two such sheets, which touch, did not converge."""
+    builder = new_builder()
+    for height in (0.0, 1e-4):
+        sheet = builder.add_body(xform=wp.transform((0.0, 0.0, 1e3 + height), wp.quat_identity()), label="sheet")
+        builder.add_shape_box(sheet, hx=0.02, hy=0.02, hz=5e-5)
+        warpmag.add_inducible(builder, body=sheet, susceptibility=1000.0)
+    with pytest.raises(warpmag.InputError, match=r"^sheet: is too far .* over a quarter of its thickness of 5e-05 m$"):
+        warpmag.Simulation(builder, device=device)
+
+
 def test_worlds_of_different_size_side_by_side(device):
     """Three worlds at one place, 1, 8 and 27 balls under a field: each moves as it does alone, in as long substeps."""
 

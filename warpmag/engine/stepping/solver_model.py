@@ -10,6 +10,9 @@ from warpmag.engine.pile_xpbd.solvers import SOLVERS
 from warpmag.engine.stepping.model_checks import articulate, check_stability
 from warpmag.errors import InputError
 
+_COARSEST = 0.25
+"""Largest spacing of single-precision positions over the thickness of a body, as far as a substep may move it."""
+
 
 def solver_model(
     builder: newton.ModelBuilder, solver: str, device: wp.Device, *, stage: str, longest_substep: float
@@ -49,14 +52,15 @@ def position_coarseness(model: newton.Model, state: newton.State, thickness: np.
     """Return the largest spacing of single-precision positions over the thickness [m] of a body, shape [bodies].
 
     Raises:
-        InputError: A body is so far from the origin that its position is unknown by more than its thickness.
+        InputError: A body is so far from the origin that its position is unknown by over a quarter of its thickness.
+            Cells of thin bodies would then overlap at random, and induction would iterate to its limit.
     """
     spacings = np.spacing(np.abs(state.body_q.numpy()[:, :3]).max(axis=1, initial=0.0))
     coarseness = spacings / thickness  # the thickness of fixed bodies is infinite
     worst = int(np.argmax(coarseness)) if len(coarseness) else -1
-    if worst >= 0 and coarseness[worst] > 1.0:
+    if worst >= 0 and coarseness[worst] > _COARSEST:
         raise InputError(
             f"{model.body_label[worst]}: is too far from the origin: positions in single precision are "
-            f"{spacings[worst]:.2g} m apart there, more than its thickness of {thickness[worst]:.2g} m"
+            f"{spacings[worst]:.2g} m apart there, over a quarter of its thickness of {thickness[worst]:.2g} m"
         )
     return float(coarseness[worst]) if worst >= 0 else 0.0
