@@ -35,9 +35,10 @@ falls to 0 at the other face. The difference is the one for which div M = 0:
     D M = −(l/n) Σ_k D M_k/l_k
 
 with the sides l of the cell, over the axes k with neighbors, for each of n axes without. Otherwise a magnet 1 mm over
-1 mm of iron would be pulled 5 % too weakly, however small the cells are. The sawtooth of these differences is not
-subtracted: without it a magnet 1 mm over 2 mm of steel would be pulled 4 % too strongly. Among other iron there are no
-such differences, because eigenvalues of the operator of two sheets that lie on each other would be smaller by up to 90 %.
+1 mm of iron would be pulled 5 % too weakly, however small the cells are. The energy of the sawtooth of these
+differences is not subtracted. If it were, a magnet 1 mm over 2 mm of steel would be pulled 4 % too strongly. Among
+other iron there are no such differences. Two sheets that lie on each other would have eigenvalues up to 90 % smaller
+with them.
 
 Magnetizations without charges have no energy. In iron they do not occur, because M follows the curl-free field H. But
 conjugate gradients need many steps for them, and errors of distant pairs of cells would make their energy negative. So
