@@ -21,9 +21,54 @@ from cell_bodies import (
 )
 
 from bench.reference import plate, surface_integrals
+from warpmag.kernels.cells.couplings import CellCouplings
 from warpmag.shapes import demagnetization, lattice, linear_cells, uniform_response
 
 SIDES = np.array([1.0, 0.7, 0.4])
+
+
+def sheet_couplings(dtype, device, moments=None):
+    """Return a sheet of one layer, the couplings of its cells as the only iron, its moments and the field [n, 3]."""
+    body = lattice.fill(lattice.box([0.012, 0.009, 0.0005]), 0.0015, together=True)
+    coupling = linear_cells.with_slopes(demagnetization.coupling(body, body.radii), body).among(1, balls=False)
+    values = np.zeros_like(body.positions) if moments is None else moments(body)
+    vectors = wp.array(values, dtype=wp.types.vector(3, dtype), device=device)
+    field = wp.zeros_like(vectors)
+    return body, CellCouplings([(0, coupling)], vectors, field, paired=True), vectors, field
+
+
+def test_magnetization_of_a_sheet_has_no_divergence(device):
+    """Half the differences of halves of M = (a x, b y, c) are those of (a x, b y, c − (a + b) z), inside the sheet."""
+    slopes = np.array([3e5, -1e5, 0.0])
+    body, couplings, _, _ = sheet_couplings(
+        wp.float64, device, lambda body: (body.positions * slopes + [0.0, 0.0, 7.0]) * body.volumes[:, None]
+    )
+    couplings.write_differences()
+    sides = body.pieces[0].sides
+    slopes[2] = -slopes.sum()
+    inside = (np.abs(body.positions[:, :2]) < np.abs(body.positions[:, :2]).max(axis=0) - 1e-6).all(axis=1)
+    magnetization = couplings.differences.numpy() / body.volumes[:, None]
+    assert inside.sum() > 20 and len(np.unique(body.positions[:, 2].round(9))) == 1
+    np.testing.assert_allclose(magnetization[inside], np.tile(0.25 * sides * slopes, (inside.sum(), 1)), rtol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [wp.float32, wp.float64])
+def test_fields_of_differences_act_on_moments_of_a_sheet_as_its_differences_do(dtype, device):
+    """The field Dᵀ g of moments m has the same energy as the field g of the differences D m."""
+    rng = np.random.default_rng(5)
+    body, couplings, vectors, field = sheet_couplings(dtype, device)
+    values, fields = rng.normal(size=(2, *body.positions.shape))
+    vectors.assign(values)
+    couplings.write_differences()
+    differences = couplings.differences.numpy().astype(float)
+    vectors.zero_()
+    couplings.write_differences()
+    couplings.difference_field.assign(fields)
+    couplings.launch()
+    energy = (differences * fields).sum()
+    size = np.linalg.norm(differences) * np.linalg.norm(fields)
+    assert (field.numpy() * values).sum() == pytest.approx(energy, abs=1e-6 * size)
+    assert abs(differences[:, 2]).max() > 0.1
 
 
 def test_tensors_of_cuboids_are_their_exact_fields_averaged():

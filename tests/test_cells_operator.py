@@ -29,7 +29,8 @@ def test_flat_cells_of_thin_plates_keep_the_operator_positive(monkeypatch):
     "solid",
     [
         lattice.sphere(1.0), lattice.box([1.0, 1.0, 1.0]), lattice.box([1.0, 1.0, 6.0]), lattice.box([6.0, 6.0, 1.0]),
-        lattice.ellipsoid([1.0, 1.0, 6.0]), lattice.cone(1.0, 1.0), lattice.cylinder(1.0, 0.3),
+        lattice.box([6.0, 6.0, 0.5]), lattice.box([0.3, 0.3, 50.0]), lattice.ellipsoid([1.0, 1.0, 6.0]),
+        lattice.cone(1.0, 1.0), lattice.cylinder(1.0, 0.3),
     ],
     ids=lambda solid: f"{solid.name}{solid.upper.max() / solid.upper.min():.0f}",
 )  # fmt: skip

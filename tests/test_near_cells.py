@@ -20,6 +20,7 @@ from warpmag.shapes.linear_cells import with_slopes
 
 REMANENCE = 1.3  # T
 PLATE = Body("box", (0.03, 0.03, 0.0015), (0.0, 0.0, -0.0015))
+SHEET = Body("box", (0.03, 0.03, 0.0005), (0.0, 0.0, -0.0005))  # one layer of cells
 TURNED = replace(PLATE, turn=0.3, center=(0.0, 0.0, -0.0055))  # 0.9 mm below the edge of the magnet
 
 
@@ -65,12 +66,14 @@ def test_tables_interpolate_the_field_around_cylinders(radius, half_height, magn
     assert error.max() < 2e-3 and np.sqrt((error**2).mean()) < 3e-4
 
 
-def test_field_of_a_near_magnet_is_its_average_over_a_cell(device):
+@pytest.mark.parametrize(("plate", "limit"), [(PLATE, 0.02), (SHEET, 0.004)], ids=["plate", "sheet"])
+def test_field_of_a_near_magnet_is_its_average_over_a_cell(plate, limit, device):
     """Midpoints of 4 × 4 squares integrate the potential of a face to about 2 %, at 1 mm from the magnet's edge.
 
-    The difference between the halves of a cell acts on the cell's slopes, which depend on its neighbors.
+    The difference between the halves of a cell acts on the cell's slopes, which depend on its neighbors. Across a sheet
+    the slope of Mz is minus the sum of those of Mx along x and of My along y.
     """
-    _, _, magnetics = iron.model_forces(with_magnet(PLATE, (0.0013, 0.0007), 1e-3), 0, device, "dipole")
+    _, _, magnetics = iron.model_forces(with_magnet(plate, (0.0013, 0.0007), 1e-3), 0, device, "dipole")
     system, magnet = magnetics.system, magpylib.magnet.Cylinder(
         polarization=(0.0, 0.0, REMANENCE), dimension=(0.02, 0.005), position=(0.0013, 0.0007, 0.0035)
     )  # fmt: skip
@@ -86,6 +89,9 @@ def test_field_of_a_near_magnet_is_its_average_over_a_cell(device):
     means = np.einsum("p,npk->nk", weights, fields)
     differences = np.einsum("pk,npk->nk", weights[:, None] * np.sign(inner), fields)
     coupling = magnetics.magnets[0].lattice.coupling
+    if plate is SHEET:
+        differences -= differences[:, 2:] * boxes[:, 2:] / boxes
+        differences[:, 2] = 0.0
     expected = means.copy()
     for side in range(6):
         k, neighbor = side // 2, coupling.neighbor[:, side]
@@ -93,10 +99,12 @@ def test_field_of_a_near_magnet_is_its_average_over_a_cell(device):
         expected[:, k] -= sign * coupling.weights[:, side] * differences[:, k]
         np.add.at(expected[:, k], neighbor, sign * coupling.weights[:, 6 + side] * differences[:, k])
     assert near.sum() > 20 and np.abs(expected - means).max() > 0.02 * np.abs(expected).max()
-    np.testing.assert_allclose(field[near], expected[near], atol=0.02 * np.abs(expected).max())
+    np.testing.assert_allclose(field[near], expected[near], atol=limit * np.abs(expected).max())
 
 
-@pytest.mark.parametrize(("plate", "magnetization"), [(PLATE, ALONG), (TURNED, ASKEW)], ids=["flat", "turned"])
+@pytest.mark.parametrize(
+    ("plate", "magnetization"), [(PLATE, ALONG), (TURNED, ASKEW), (SHEET, ASKEW)], ids=["flat", "turned", "sheet"]
+)
 @pytest.mark.parametrize("gap", [1e-4, 3.7e-3], ids=["close", "fading"])
 def test_force_is_the_derivative_of_the_energy(plate, magnetization, gap, device):
     """At 3.7 mm the averages fade. Rounding of the energy in float32 over steps of 0.02 mm is 1 % of the force."""
@@ -154,16 +162,42 @@ def test_fine_cells_of_thick_iron_pull_right(gap, device):
 
 @pytest.mark.parametrize("permeability", ["1", "1.05"])
 def test_thin_plate_that_is_the_only_iron_pulls_right(permeability, device):
-    """The error is 1.7 %. Beside a ball of iron it is 3.1 %: less of the sawtooth of the slopes is subtracted there.
+    """The error is 0.8 %. Beside a ball of iron it is 3.1 %, because Mz has no slope across the plate there.
 
     A magnet with recoil permeability does not count as iron.
     """
     name = f"magnet μ {permeability} over iron plate 1, gap 1"
     setup, expected = SETUPS[name], load()[name]["forces"][1][2]
     ball = Body("ball", (0.005,), (0.0, 0.0, 0.3))
-    for bodies, limit in ((setup.bodies, 0.025), ((*setup.bodies, ball), 0.04)):
+    for bodies, limit in ((setup.bodies, 0.01), ((*setup.bodies, ball), 0.04)):
         forces, _, _ = iron.model_forces(replace(setup, bodies=bodies), 0, device, "dipole")
         assert forces[1, 2] == pytest.approx(expected, rel=limit)
+
+
+@pytest.mark.parametrize(("gap", "limit"), [("0.02", 0.01), ("1", 0.035), ("5", 0.022), ("20", 0.015)])
+def test_fine_cells_of_a_thin_plate_pull_right(gap, limit, device):
+    """Errors are 0.3, 3.1, 1.8 and 1.2 %. Without a slope of Mz across the plate they were 2.9, 5.4, 3.0 and 2.0 %."""
+    name = f"magnet μ 1 over iron plate 1, gap {gap}"
+    forces, _, _ = iron.model_forces(SETUPS[name], 2000, device, "dipole")
+    assert forces[1, 2] == pytest.approx(load()[name]["forces"][1][2], rel=limit)
+
+
+def test_ball_magnet_over_a_sheet(device):
+    """Cells and a ball of one moment act on each other in pairs. Their force is the derivative of the energy."""
+    step, gap, size = 2e-5, 1e-3, 0.004
+    magnet = Body("ball", (size,), (0.0013, 0.0007, gap + size), 0.0, magnetization=ASKEW)
+    forces, _, _ = iron.model_forces(Setup((SHEET, magnet)), 0, device, "dipole")
+    for axis in (0, 2):
+        energies = []
+        for sign in (-1.0, 1.0):
+            center = np.array(magnet.center)
+            center[axis] += sign * step
+            setup = Setup((SHEET, replace(magnet, center=tuple(center))))
+            _, _, magnetics = iron.model_forces(setup, 0, device, "dipole")
+            energies.append(float(magnetics.energy()[0]))
+        expected = -(energies[1] - energies[0]) / (2.0 * step)
+        assert abs(forces[1, axis] - expected) < 0.01 * np.linalg.norm(forces[1])
+    np.testing.assert_allclose(forces.sum(axis=0), 0.0, atol=2e-6 * np.abs(forces).max())
 
 
 @pytest.mark.parametrize("depth", [0.0, 2e-6, 5e-5])
@@ -188,7 +222,11 @@ def test_charges_of_a_face_have_no_sum():
     )  # a length
 
 
-@pytest.mark.parametrize("solid", [lattice.box([0.02, 0.02, 0.0015]), lattice.cylinder(0.01, 0.004)])
+@pytest.mark.parametrize(
+    "solid",
+    [lattice.box([0.02, 0.02, 0.0015]), lattice.box([0.02, 0.02, 0.0005]), lattice.cylinder(0.01, 0.004)],
+    ids=["plate", "sheet", "cylinder"],
+)
 def test_slopes_keep_the_energy_of_uniform_magnetization(solid):
     """It has neither slopes nor a curl, except where the surface cuts cells. The operator stays positive."""
     body = lattice.fill(solid, 0.0, lattice.LEAST_ACROSS, together=True)

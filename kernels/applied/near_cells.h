@@ -12,6 +12,7 @@
 #pragma once
 #include "applied/cylinder.h"
 #include "applied/target_field.h"
+#include "shared/layer.h"
 
 namespace warpmag {
 
@@ -144,6 +145,10 @@ CUDA_CALLABLE inline PotentialField outer_field(const PermanentBody& body, const
     const PotentialField f = potential_field_of(body.solid, body.m, points.at);
     return {f.phi - points.charge * points.height, body.frame.to_world(f.h + points.charge * points.normal)};
 }
+// Factors of differences across layers of cell c.
+template <class Arrays> CUDA_CALLABLE inline Real3 layer_of(const Arrays& arrays, int c) {
+    return real3(arrays.cells.layer.data + 3 * (size_t)arrays.cells.row.data[c]);
+}
 template <class Vectors> CUDA_CALLABLE inline void put_real3(const Vectors& to, int i, Real3 v) {
     Real* const at = (Real*)to.data + 3 * (size_t)i;
     at[0] = v.x, at[1] = v.y, at[2] = v.z;
@@ -246,7 +251,7 @@ template <class Arrays> CUDA_CALLABLE inline void average_over_cell(const Arrays
     if (share() != 0) return;
     arrays.cells.near.data[c] = nearness;
     put_real3(arrays.cells.change, c, acting);
-    put_real3(arrays.cells.steepness, c, steepness);
+    put_real3(arrays.cells.steepness, c, layer_fields(layer_of(arrays, c), steepness));
     add_real3(arrays.targets.field, cell.moment, field);
     add_real3(arrays.targets.acting, cell.moment, acting);
 }
@@ -313,7 +318,7 @@ CUDA_CALLABLE inline Real3 moment_differences(const Arrays& arrays, const Cell& 
             d[k] += (side % 2 ? Real(0.25) : Real(-0.25)) * change;
         }
     }
-    return {d[0], d[1], d[2]};
+    return layer_differences(layer_of(arrays, c), Real3{d[0], d[1], d[2]});
 }
 // Wrench/μ0 of a body on the charges of a cell by its moment, differences and response, at fine or coarse points.
 CUDA_CALLABLE inline Wrench wrench_on_charges(const Cell& cell, const PermanentBody& body, const Real* cylinder,

@@ -48,6 +48,7 @@ def cell_arrays_type(dtype):
         half: wp.array2d[dtype]  # half sides [m], shape [rows, 3]
         neighbor: wp.array2d[int]  # index of the neighbor on each side, less that of the cell, shape [rows, 6]
         weight: wp.array2d[dtype]  # weights of a cell and of its neighbors in its differences, shape [rows, 12]
+        layer: wp.array2d[dtype]  # factors of differences across layers (``shared/layer.h``), shape [rows, 3]
         # Cells, shape [cells]:
         row: wp.array[int]  # row of the cell in the arrays of shapes
         cell: wp.array[wp.vec4i]  # moment, index of its body in ``rotation``, range of permanent bodies
@@ -67,7 +68,8 @@ def cell_arrays_type(dtype):
         torques: wp.array[vec3]  # about the moments' positions [N·m], added to
         # Data out:
         change: wp.array[vec3]  # change of the field that exerts torques by the averages [A/m], shape [cells]
-        steepness: wp.array[vec3]  # half the field's difference between a cell's halves, along the grid [A/m], [cells]
+        steepness: wp.array[vec3]  # half the difference of the field between a cell's halves, as it acts on differences
+        # between neighbors (``shared/layer.h``), along the grid [A/m], shape [cells]
         wrench: wp.array2d[
             dtype
         ]  # force/μ0 and torque/μ0 of a source that is the only one [A²], [A² m], shape [cells, 6]
@@ -114,6 +116,7 @@ def _table(coupling, kind: int, scalar) -> dict[str, np.ndarray]:
         "half": coupling.half_sides.astype(scalar),
         "neighbor": (coupling.neighbor - np.arange(count)[:, None]).astype(np.int32),
         "weight": coupling.weights.astype(scalar),
+        "layer": coupling.layer.astype(scalar),
     }
 
 
@@ -148,7 +151,8 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solids, so
     tables = [_table(body.coupling, k, wp.dtype_to_numpy(dtype)) for k, body in enumerate(shapes)]
     sizes = np.array([len(table["form"]) for table in tables])
     counts, begins = sizes[kind], (np.cumsum(sizes) - sizes)[kind]
-    for name, warp_type in (("form", wp.vec2i), ("half", dtype), ("neighbor", wp.int32), ("weight", dtype)):
+    types = {"form": wp.vec2i, "half": dtype, "neighbor": wp.int32, "weight": dtype, "layer": dtype}
+    for name, warp_type in types.items():
         setattr(arrays, name, put(np.concatenate([table[name] for table in tables]), warp_type))
     firsts = np.array([body.first for body in used])
     of_bodies = np.column_stack([begins, firsts, numbers, solid_ranges[firsts]]).astype(np.int32)

@@ -11,6 +11,7 @@
 #include "cells/rotation.h"
 #include "shared/active.h"
 #include "shared/group.h"
+#include "shared/layer.h"
 #include "shared/team.h"
 
 namespace warpmag {
@@ -106,6 +107,13 @@ CUDA_CALLABLE inline Neighbors neighbors_at(const Couplings& c, const CellSpan& 
     return {j, own, numbers(inward), mask_of(own > zero) ? back : zero}; // a cell without a neighbor has itself
 }
 
+// Factors of differences across layers.
+template <class Couplings> CUDA_CALLABLE inline Vector layer_at(const Couplings& c, const CellSpan& at) {
+    const size_t pitch = c.layer.strides[0] / sizeof(Real);
+    const Real* const factors = c.layer.data + at.table_row + (at.row - at.first_row);
+    return {numbers(factors), numbers(factors + pitch), numbers(factors + 2 * pitch)};
+}
+
 // Writes moments and half differences in the frame of the grid.
 template <class Couplings> CUDA_CALLABLE inline void write_differences(const Couplings& c, const CellSpan& at) {
     const Rotation<Real> frame = frame_of(c, at);
@@ -124,14 +132,18 @@ template <class Couplings> CUDA_CALLABLE inline void write_differences(const Cou
     if (share() != 0) return;
     put_row(c.body_moments, at.row, 0, m);
     put_vectors((Real*)c.means.data + 3 * (size_t)at.i, at.count, m);
-    put_vectors((Real*)c.differences.data + 3 * (size_t)at.i, at.count, {difference[0], difference[1], difference[2]});
+    Vector along = {difference[0], difference[1], difference[2]};
+    if (c.has_layers) along = layer_differences(layer_at(c, at), along);
+    put_vectors((Real*)c.differences.data + 3 * (size_t)at.i, at.count, along);
     put_vectors((Real*)c.difference_field.data + 3 * (size_t)at.i, at.count, {m.x * 0, m.x * 0, m.x * 0});
 }
 
-// Writes the fields of differences by rows.
+// Writes the fields that act on differences between neighbors by rows.
 template <class Couplings> CUDA_CALLABLE inline void transpose_fields(const Couplings& c, const CellSpan& at) {
-    if (share() == 0)
-        put_row(c.fields, at.row, 0, vectors((const Real*)c.difference_field.data + 3 * (size_t)at.i, at.count));
+    if (share() != 0) return;
+    Vector fields = vectors((const Real*)c.difference_field.data + 3 * (size_t)at.i, at.count);
+    if (c.has_layers) fields = layer_fields(layer_at(c, at), fields);
+    put_row(c.fields, at.row, 0, fields);
 }
 
 // Dᵀ of the field of differences.

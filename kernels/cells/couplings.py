@@ -35,6 +35,8 @@ def couplings_type(dtype):
         tensor: wp.array[dtype]  # T_ij [1/m³], row after row, of CHUNK cells per slot; zero after a list's end
         side: wp.array2d[int]  # neighbor of each cell on the sides −x, +x, −y, ..., or the cell, shape [6, rows]
         weight: wp.array2d[dtype]  # weights in differences: of the cell's moment, of the neighbors', shape [12, rows]
+        layer: wp.array2d[dtype]  # factors of differences across layers (``shared/layer.h``), shape [3, rows]
+        has_layers: int  # 1 if any of these factors is not 0
         has_slopes: int  # 1 if any weight is not 0
         # Model: bodies
         chunk: wp.array[wp.vec4i]  # first moment, count, first row of the body, first row of its table, shape [chunks]
@@ -149,14 +151,14 @@ class CellCouplings:
 
     def _lay_out(self, bodies, dtype, device):
         """Fill the arrays."""
-        c, first_rows, tables, sides, weights = self._couplings, {}, [], [], []
+        c, first_rows, tables, sides, weights, layers = self._couplings, {}, [], [], [], []
         for _, coupling in bodies:
             if id(coupling) not in first_rows:
                 first_rows[id(coupling)] = CHUNK * sum(len(slots) for slots, _, _ in tables)
                 tables.append(_table(coupling.start, coupling.other, coupling.grid_tensor.reshape(-1, 9)))
-                values = coupling.neighbor, coupling.weights
+                values = coupling.neighbor, coupling.weights, coupling.layer
                 padding = (0, 0), (0, -len(coupling.radii) % CHUNK)
-                for parts, value in zip((sides, weights), values, strict=True):
+                for parts, value in zip((sides, weights, layers), values, strict=True):
                     parts.append(np.pad(value.T, padding))
         first = np.array([first for first, _ in bodies])
         body, begin, end = cut(first, first + [len(coupling.radii) for _, coupling in bodies], CHUNK)
@@ -178,6 +180,7 @@ class CellCouplings:
         c.matrix = put(np.concatenate([coupling.grid_common.ravel() for _, coupling in bodies]), dtype)
         c.common = wp.zeros(3 * len(bodies), dtype=dtype, device=device)
         c.side, c.weight = put(np.concatenate(sides, axis=1), wp.int32), put(np.concatenate(weights, axis=1), dtype)
+        c.layer, c.has_layers = put(np.concatenate(layers, axis=1), dtype), int(any(part.any() for part in layers))
         c.has_slopes = int(any(part.any() for part in weights))
         c.body_moments = wp.zeros((3, CHUNK * len(chunks)), dtype=dtype, device=device)
         c.fields = wp.zeros((3, CHUNK * len(chunks)), dtype=dtype, device=device)

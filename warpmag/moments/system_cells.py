@@ -57,7 +57,7 @@ class SystemCells:
             takes_part = self._takes_part * layout.copies
             arrays = rotatable, packed, h, forces, torques
             self.pairs = CellPairs(self.bodies, takes_part, self.couplings, layout.whole(), *arrays)
-        self._alone, self._wrenches = couplings, (forces, torques)
+        self._of_one_copy, self._wrenches = bodies, (forces, torques)
 
     @property
     def crowded(self) -> wp.array | None:
@@ -66,8 +66,8 @@ class SystemCells:
 
     def average_sources(self, sources: AppliedForces):
         """Average the fields of permanent bodies over the cells near them."""
-        bodies: list[NearCellBody | None] = [None] * len(self._alone)
-        for number, (first, coupling) in enumerate(self._alone):
+        bodies: list[NearCellBody | None] = [None] * len(self._of_one_copy)
+        for number, (first, coupling) in enumerate(self._of_one_copy):
             if self._takes_part[number]:
                 response = face_response(tuple(coupling.cell_sides), FACE_SPLIT)
                 bodies[number] = NearCellBody(first, coupling, response)

@@ -52,6 +52,14 @@ _BATCH = 1 << 22
 
 
 @dataclass(frozen=True)
+class LoneSlopes:
+    """Changes of :class:`Slopes` in a world without other iron."""
+
+    layer: np.ndarray  # ``Slopes.layer`` there, shape [n, 3]
+    tensor: dict[tuple[int, int], np.ndarray]  # added to components (k, j) of T_ij [1/m³], shape [entries] each
+
+
+@dataclass(frozen=True)
 class Slopes:
     """Neighbors of a body's linear cells (``linear_cells.py``), and the correction of the pair sums between them.
 
@@ -60,8 +68,18 @@ class Slopes:
 
     neighbor: np.ndarray  # neighbor of each cell on each side, the cell itself where there is none, shape [n, 6]
     weight: np.ndarray  # weights w of the neighbors, shape [n, 6]
+    layer: np.ndarray  # factors of differences across layers of one cell (``linear_cells.py``), shape [n, 3]
     tensor: np.ndarray  # T_ij [1/m³] for the entries of the coupling, H_i += Σ T_ij m_j, shape [entries, 3, 3]
-    alone: np.ndarray  # added to xx, yy, zz of T_ij in a world without other iron [1/m³], shape [entries, 3]
+    alone: LoneSlopes | None  # changes in a world without other iron; None if ``tensor`` contains them
+
+    def without_other_iron(self) -> "Slopes":
+        """Return the slopes in a world without other iron."""
+        if self.alone is None:
+            return self
+        tensor = self.tensor.copy()
+        for (k, j), added in self.alone.tensor.items():
+            tensor[:, k, j] += added
+        return Slopes(self.neighbor, self.weight, self.alone.layer, tensor, None)
 
 
 @dataclass(frozen=True)
@@ -104,14 +122,12 @@ class Coupling:
 
         C replaces charges near edges. Where bodies touch there are none, so C is divided by ``bodies``. With all of C
         the operator of a closed ring of bodies would not be positive. ``balls`` is True if the world has iron balls.
-        For the only iron of a world the whole energy of the sawtooth is subtracted (``linear_cells.py``). Bodies that
-        share a coupling share the results.
+        The only iron of a world has other slopes (``linear_cells.py``). Bodies that share a coupling share the results.
         """
         if (bodies, balls) not in self._among:
             slopes = self.slopes
             if slopes is not None and bodies == 1 and not balls:
-                tensor = slopes.tensor + slopes.alone[..., None] * np.eye(3)
-                slopes = replace(slopes, tensor=tensor, alone=np.zeros_like(slopes.alone))
+                slopes = slopes.without_other_iron()
             self._among[bodies, balls] = replace(self, common=self.common / bodies, slopes=slopes)
         return self._among[bodies, balls]
 
@@ -145,6 +161,11 @@ class Coupling:
             return np.zeros((len(self.radii), 12))
         ratio = (self.radii[:, None] / self.radii[self.neighbor]) ** 3
         return np.concatenate([self.slopes.weight, self.slopes.weight * ratio], axis=1)
+
+    @property
+    def layer(self) -> np.ndarray:
+        """Factors of differences across layers of one cell, 0 for uniform cells, shape [n, 3]."""
+        return np.zeros((len(self.radii), 3)) if self.slopes is None else self.slopes.layer
 
 
 def couplings_in_worlds(
