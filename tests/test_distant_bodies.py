@@ -253,7 +253,8 @@ def test_fields_moments_and_values_of_few_moments_are_those_of_cells(device, mon
         actual, expected = magnetics.b_field(points), cells.b_field(points)
         # inside, the patterns are those of ideal permeability
         assert relative(actual[0], expected[0]) < 5e-3 and relative(actual[1:], expected[1:]) < 0.08
-        np.testing.assert_allclose(magnetics.shape_moments(), cells.shape_moments(), rtol=1e-2, atol=1e-4)
+        actual, expected = magnetics.shape_moments(), cells.shape_moments()
+        assert (np.linalg.norm(actual - expected, axis=-1) < 1e-2 * np.linalg.norm(expected, axis=-1)).all()
         np.testing.assert_allclose(magnetics.energy(), cells.energy(), rtol=1e-3)
 
 
