@@ -191,8 +191,9 @@ template <class Pairs> CUDA_CALLABLE inline void tabulate(const Pairs& a, int ro
             overlap += near & other_box.inducible ? overlap_share(box, other_box, pose) : zero;
         tabulate_slot(rows, slot, points, box, other, other_box, pose, near);
     });
-    const Number within = (group_sum(overlap) - OVERLAP_BEGIN) / (OVERLAP_END - OVERLAP_BEGIN);
-    overlap = smaller(larger(within, zero), zero + 1);
+    const Number shares = group_sum(overlap), within = (shares - OVERLAP_BEGIN) / (OVERLAP_END - OVERLAP_BEGIN);
+    // a cell inside several bodies: the errors of their tensors add up
+    overlap = larger(smaller(larger(within, zero), zero + 1), shares);
     end = group_most(end);
     if (share() == 0) a.near_end.data[row] = end;
     if (share() == 0) put(a.overlap_factor.data + row, OVERLAP_DEMAGNETIZATION * overlap / box.volume);

@@ -74,9 +74,13 @@ class Reading:
         return prim or None
 
     def driven(self) -> list:
-        """Colliders of no body that time samples move, and that are in none of them: they become kinematic bodies."""
+        """Colliders and coils of no body that time samples move, and that are in none of them.
+
+        They become kinematic bodies.
+        """
+        coils = [prim for prim in self.prims if "WarpmagCoilAPI" in prim.GetAppliedSchemas()]
         moving = []
-        for prim in self.colliders:
+        for prim in [*self.colliders, *(coil for coil in coils if coil not in self.colliders)]:
             lineage = [prim, *(ancestor for ancestor in self.prims if prim.GetPath().HasPrefix(ancestor.GetPath()))]
             if self.above(prim) or not set(lineage).isdisjoint(moving):
                 continue

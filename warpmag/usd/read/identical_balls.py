@@ -12,7 +12,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
 from warpmag.declarations.rotations import conjugate, cross, multiply, rotate
 from warpmag.usd.read.prims import descendants, is_body, is_collider, lineage
-from warpmag.usd.read.transforms import is_animated, rotation_of
+from warpmag.usd.read.transforms import LARGEST_COORDINATE, is_animated, rotation_of
 from warpmag.usd.read.units import units_of
 from warpmag.usd.schemas import MAGNET_API
 
@@ -164,11 +164,15 @@ def identical_balls(
 ) -> Iterator[IdenticalBalls]:
     """Yield groups of two or more identical balls of an instancer; none unless units are SI and arrays are finite.
 
+    None either if an instance is out of bounds: as a prim it has an error.
     Each of n instances has a path, a row in the arrays, and a kind: its prototype and scale, shape [n, 1] or [n, 4].
     """
     stage = instancer.GetPrim().GetStage()
     finite = all(np.isfinite(values).all() for values in arrays.values())
     if not (finite and units_of(stage).are_si and _has_interchangeable_instances(stage, instancer, time_code)):
+        return
+    world = np.array(UsdGeom.XformCache(Usd.TimeCode(time_code)).GetLocalToWorldTransform(instancer.GetPrim()))
+    if not np.abs(arrays["positions"] @ world[:3, :3] + world[3, :3]).max(initial=0.0) <= LARGEST_COORDINATE:
         return
     targets = instancer.GetPrototypesRel().GetForwardedTargets()
     bodies = [_ball_in(stage.GetPrimAtPath(target)) for target in targets]
