@@ -2,10 +2,13 @@
 
 from dataclasses import asdict
 
+import newton
 import numpy as np
 import pytest
+import warp as wp
 from scipy.spatial.transform import Rotation
 
+import warpmag
 from bench import heaps
 
 
@@ -47,6 +50,23 @@ def test_sheets_that_intersect_are_stable(which, device):
     (verdict,) = heaps.SolvedHeaps([heaps.Heap(pieces, np.array([0.0, 1e3, 500.0]))], device).verdicts(0, 400)
     assert verdict.passes and verdict.operator is not None
     assert verdict.demagnetization is not None and verdict.demagnetization > 0.0
+
+
+@pytest.mark.parametrize("spread", [5e-4, 4e-3])
+def test_many_bodies_that_intersect_converge(spread, device):
+    """30 cones in nearly one place. With the added demagnetization of one overlap the residual grew."""
+    rng, builder = np.random.default_rng(3), newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    warpmag.register_custom_attributes(builder)
+    for _ in range(30):
+        place, turn = rng.uniform(-spread, spread, 3), rng.normal(size=3) * 50.0 * spread
+        cone = builder.add_body(xform=wp.transform(wp.vec3(*place), wp.quat(*Rotation.from_rotvec(turn).as_quat())))
+        builder.add_shape_cone(cone, radius=0.01, half_height=0.02)
+        warpmag.add_inducible(builder, body=cone, moment_spacing=0.005)
+    model = builder.finalize(device=device)
+    magnetics = warpmag.Magnetics(model)
+    magnetics.set_external_field((0.0, 2e4, 5e3))
+    magnetics.induce(model.state())
+    assert magnetics.system.converged.numpy().all() and magnetics.evaluations.numpy().max() < 100
 
 
 def test_heaps_have_all_shapes_and_materials():

@@ -35,6 +35,17 @@ REFUSED = {
         [physics(), ball("A", (0, 0, 1), "float warpmag:momentSpacing = 1e-5")],
         "/World/A: warpmag:momentSpacing 1e-05 m needs more than 20000 moments for one body",
     ),
+    "a ball of an instancer that is out of bounds": (
+        [
+            physics(),
+            'def PointInstancer "Balls" {\n    rel prototypes = </World/Balls/Ball>\n'
+            "    int[] protoIndices = [0, 0, 0]\n"
+            "    point3f[] positions = [(0, 0, 1), (0, 0, 2), (0, 0, 1e9)]\n",
+            ball("Ball", (0, 0, 0)),
+            "}\n",
+        ],
+        "/World/Balls/instance2/Ball: transform reaches 1e+09, beyond 1e+08",
+    ),
     "an open mesh": (
         [physics(), OPEN.format(approximation="none")],
         "/World/Open: mesh: not closed and consistently oriented",

@@ -6,8 +6,8 @@
 // computed again when the relative pose of their bodies has changed.
 //
 // From Python: OVERLAP_DEMAGNETIZATION, the demagnetizing factor added to a cell inside another body, OVERLAP_BEGIN and
-// OVERLAP_END, the shares of its volume from which it gets some and all of it; MU0; and the constants of
-// ``cell_rows.h``.
+// OVERLAP_END, the shares of its volume from which it gets some and all of it; OVERLAP_BODIES, the number of bodies
+// around a cell beyond which the factor grows; MU0; and the constants of ``cell_rows.h``.
 // ``CellPairs`` is the struct of cell_pairs.py.
 #pragma once
 #include "cells/cell_rows.h"
@@ -192,8 +192,8 @@ template <class Pairs> CUDA_CALLABLE inline void tabulate(const Pairs& a, int ro
         tabulate_slot(rows, slot, points, box, other, other_box, pose, near);
     });
     const Number shares = group_sum(overlap), within = (shares - OVERLAP_BEGIN) / (OVERLAP_END - OVERLAP_BEGIN);
-    // a cell inside several bodies: the errors of their tensors add up
-    overlap = larger(smaller(larger(within, zero), zero + 1), shares);
+    // inside many bodies the errors of their tensors add up
+    overlap = larger(smaller(larger(within, zero), zero + 1), shares * (1 / Real(OVERLAP_BODIES)));
     end = group_most(end);
     if (share() == 0) a.near_end.data[row] = end;
     if (share() == 0) put(a.overlap_factor.data + row, OVERLAP_DEMAGNETIZATION * overlap / box.volume);
