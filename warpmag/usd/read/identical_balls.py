@@ -172,7 +172,8 @@ def identical_balls(
     if not (finite and units_of(stage).are_si and _has_interchangeable_instances(stage, instancer, time_code)):
         return
     world = np.array(UsdGeom.XformCache(Usd.TimeCode(time_code)).GetLocalToWorldTransform(instancer.GetPrim()))
-    if not np.abs(arrays["positions"] @ world[:3, :3] + world[3, :3]).max(initial=0.0) <= LARGEST_COORDINATE:
+    positions = arrays["positions"].reshape(-1, 3)  # an instancer may have none
+    if not np.abs(positions @ world[:3, :3] + world[3, :3]).max(initial=0.0) <= LARGEST_COORDINATE:
         return
     targets = instancer.GetPrototypesRel().GetForwardedTargets()
     bodies = [_ball_in(stage.GetPrimAtPath(target)) for target in targets]
