@@ -46,6 +46,10 @@ REFUSED = {
         ],
         "/World/Balls/instance2/Ball: transform reaches 1e+09, beyond 1e+08",
     ),
+    "an instancer without instances": (
+        [physics(), A, 'def PointInstancer "Empty" (prepend apiSchemas = ["WarpmagSceneAPI"]) {}\n'],
+        "/World/Empty: WarpmagSceneAPI on a prim that is not a PhysicsScene",
+    ),
     "an open mesh": (
         [physics(), OPEN.format(approximation="none")],
         "/World/Open: mesh: not closed and consistently oriented",

@@ -283,11 +283,6 @@ def test_a_prototype_with_an_order_of_another_type(tmp_path, order):
         check(write(tmp_path, instancer(["Ball"], [0], [(0, 0, 0)], inner=inner)))
 
 
-def test_an_instancer_without_instances(tmp_path):
-    path = write(tmp_path, MAGNET, instancer(["Ball"], [], [], inner=BALL))
-    assert not check(path).errors and len(import_scene(path).bodies) == 0
-
-
 def test_an_instancer_within_itself(tmp_path):
     path = write(tmp_path, instancer(["Ball"], [0], [(0, 0, 0)], inner=BALL).replace("/Kinds/Ball", ""))
     with pytest.raises(InputError, match=r"^/World/Many: a PointInstancer that is part of its own prototypes"):
