@@ -192,8 +192,8 @@ template <class Pairs> CUDA_CALLABLE inline void tabulate(const Pairs& a, int ro
         tabulate_slot(rows, slot, points, box, other, other_box, pose, near);
     });
     const Number shares = group_sum(overlap), within = (shares - OVERLAP_BEGIN) / (OVERLAP_END - OVERLAP_BEGIN);
-    // inside many bodies the errors of their tensors add up
-    overlap = larger(smaller(larger(within, zero), zero + 1), shares * (1 / Real(OVERLAP_BODIES)));
+    const Number of_many = shares * (1 / Real(OVERLAP_BODIES)); // the errors of their tensors add up
+    overlap = of_many > 1 ? of_many : smaller(larger(within, zero), zero + 1);
     end = group_most(end);
     if (share() == 0) a.near_end.data[row] = end;
     if (share() == 0) put(a.overlap_factor.data + row, OVERLAP_DEMAGNETIZATION * overlap / box.volume);
