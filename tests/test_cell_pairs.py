@@ -16,6 +16,7 @@ from bench.reference import boxes, oracle
 from bench.systems import moment_system
 from warpmag.kernels.cells import cell_pairs
 from warpmag.kernels.cells.cell_pairs import CLOSE, WINDOW
+from warpmag.moments.arrays import restore_snapshot, take_snapshot
 from warpmag.shapes import demagnetization, lattice
 from warpmag.shapes.linear_cells import LEAST_CELLS, with_slopes
 
@@ -310,7 +311,7 @@ def test_tables_rest_until_a_box_moves(device):
     system, _ = make_pair(bodies, place, dtype="float32", device=device, susceptibility=math.inf)
     system.solve()
     pairs = system._cells.pairs
-    kept = {name: wp.clone(array) for name, array in pairs.persistent_arrays().items()}
+    kept = take_snapshot(pairs.persistent_arrays())
     exact = pairs.arrays.matrix.numpy().copy()
 
     def changes_by_find():
@@ -323,8 +324,7 @@ def test_tables_rest_until_a_box_moves(device):
     assert not changes_by_find()
     put(system, bodies, [place[0], (Rotation.identity(), np.array([1e-4, 0.0, 0.0071]))])
     assert changes_by_find()
-    for name, array in pairs.persistent_arrays().items():
-        wp.copy(array, kept[name])
+    restore_snapshot(pairs.persistent_arrays(), kept)
     put(system, bodies, place)
     assert not changes_by_find()
     np.testing.assert_array_equal(pairs.arrays.matrix.numpy(), exact)

@@ -11,8 +11,9 @@ that intersect the points can make it negative. So a cell inside another body ge
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import warp as wp
@@ -346,10 +347,23 @@ class CellPairs:
         for launch in self._force:
             launch.launch()
 
-    def persistent_arrays(self) -> dict[str, wp.array]:
-        """Return the arrays that the next search and the next evaluation read, by name."""
-        kept = (
-            "box", "rows", "cell", "row_of", "column", "other_slot", "pose", "matrix", "detail", "overlap_factor",
-            "near_end", "crowded", "kind_end",
-        )  # fmt: skip
-        return neighbors.persistent_lists(self._lists) | {name: getattr(self.arrays, name) for name in kept}
+    def persistent_arrays(self) -> dict[str, wp.array | Callable[[], wp.array]]:
+        """Return the arrays that the next search and the next evaluation read, by name, and functions that return them.
+
+        The functions return the parts of the tables of pairs in use. They need the other arrays of the same time. The
+        tables have room for far more pairs than most scenes have.
+        """
+        names = "box", "rows", "cell", "row_of", "overlap_factor", "near_end", "crowded", "kind_end"
+        tables = {"column": 1, "other_slot": 1, "pose": _POSE_ROWS, "matrix": _MATRIX_ROWS, "detail": _DETAIL_ROWS}
+        result = neighbors.persistent_lists(self._lists) | {name: getattr(self.arrays, name) for name in names}
+        return result | {name: partial(self._used_part, name, numbers) for name, numbers in tables.items()}
+
+    def _used_part(self, name: str, numbers: int) -> wp.array:
+        """Return the part of a table, with so many numbers a pair, that has pairs. Waits for the device."""
+        pairs, table = self.arrays, getattr(self.arrays, name)
+        if not table.size:
+            return table
+        chunks = -(-int(pairs.rows.numpy()[0]) // CHUNK)
+        slots = int(pairs.kind_end.numpy().reshape(-1, _KINDS)[:, -1].max(initial=0))
+        capacity = table.size // (pairs.cell.size * numbers)
+        return table.reshape((pairs.cell.size // CHUNK, capacity, numbers * CHUNK))[:chunks, : min(slots, capacity)]

@@ -5,6 +5,7 @@ Calls on arrays take NumPy or Warp arrays and return arrays of the same kind. Sn
 
 import math
 import numbers
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,8 @@ from warpmag.moments.ranks import launched_ranks
 
 Numbers = npt.ArrayLike | wp.array
 """Type of array arguments: numbers, lists of numbers, NumPy arrays and Warp arrays."""
+PersistentArray = wp.array | Callable[[], wp.array]
+"""Array in a snapshot, or a function that returns its part in use."""
 DTYPES = {"float32": wp.float32, "float64": wp.float64}
 RADIUS_RANGE = {wp.float32: (5e-8, 2e4), wp.float64: (1e-30, 1e30)}
 """Smallest and largest radius [m] of a ball by Warp scalar type: neither r⁻⁵ nor products of moments may overflow."""
@@ -312,29 +315,29 @@ def resolve_context(first, dtype: str, device) -> CallContext:
     return CallContext(resolve_device(device), resolve_dtype(dtype), warp_out)
 
 
-def _memory(array: wp.array) -> wp.array:
-    """Return the memory of a contiguous array as a Warp array of bytes."""
-    assert array.is_contiguous, "a snapshot needs contiguous memory"
-    size = array.size * wp.types.type_size_in_bytes(array.dtype)
-    return wp.array(ptr=array.ptr, dtype=wp.uint8, shape=size, device=array.device)
+def _bytes(array: PersistentArray) -> np.ndarray:
+    """Return the bytes of an array, without copying those of a contiguous one on a CPU."""
+    array = array() if callable(array) else array
+    return np.ascontiguousarray(array.numpy()).reshape(-1).view(np.uint8)
 
 
-def snapshot_views(arrays: dict[str, wp.array]) -> dict[str, np.ndarray]:
+def snapshot_views(arrays: dict[str, PersistentArray]) -> dict[str, np.ndarray]:
     """Return the bytes of each array, without copying on a CPU: such a view changes with its array."""
-    return {name: _memory(array).numpy() for name, array in arrays.items() if array.size}
+    return {name: data for name, array in arrays.items() if (data := _bytes(array)).size}
 
 
-def take_snapshot(arrays: dict[str, wp.array]) -> dict[str, np.ndarray]:
+def take_snapshot(arrays: dict[str, PersistentArray]) -> dict[str, np.ndarray]:
     """Return a copy of the bytes of each array, by name."""
-    views = snapshot_views(arrays)
-    return {name: view.copy() if arrays[name].device.is_cpu else view for name, view in views.items()}
+    return {name: data.copy() for name, data in snapshot_views(arrays).items()}
 
 
-def restore_snapshot(arrays: dict[str, wp.array], saved: dict[str, np.ndarray]) -> None:
+def restore_snapshot(arrays: dict[str, PersistentArray], saved: dict[str, np.ndarray]) -> None:
     """Copy the bytes that :func:`take_snapshot` returned back into the arrays, which must have the same sizes."""
-    for name, array in arrays.items():
+    for name, persistent in arrays.items():
+        array = persistent() if callable(persistent) else persistent
         if array.size:
-            memory, data = _memory(array), saved.get(name)
-            if data is None or data.dtype != np.uint8 or data.shape != memory.shape:
+            data, size = saved.get(name), array.size * wp.types.type_size_in_bytes(array.dtype)
+            if data is None or data.dtype != np.uint8 or data.shape != (size,):
                 raise InputError(f"checkpoint: {name} does not fit this run")
-            memory.assign(data)
+            same = wp.array(ptr=data.ctypes.data, dtype=array.dtype, shape=array.shape, device="cpu")
+            wp.copy(array, same)

@@ -25,7 +25,14 @@ from warpmag.kernels.pairs.pair_law import Quantity
 from warpmag.kernels.pairs.work_list import pair_count
 from warpmag.kernels.pairs.wrench import launch_zeeman_moments
 from warpmag.kernels.shared.copies import put_copies, repeat_records, repeat_rows
-from warpmag.moments.arrays import host_array, resolve_device, resolve_dtype, shape_message, vec3_type
+from warpmag.moments.arrays import (
+    PersistentArray,
+    host_array,
+    resolve_device,
+    resolve_dtype,
+    shape_message,
+    vec3_type,
+)
 from warpmag.moments.body_steps import make_body_steps
 from warpmag.moments.dynamics import make_dynamics
 from warpmag.moments.fmm import SystemSums, fast_sums_for
@@ -347,7 +354,7 @@ class MomentSystem:
         if self.source_interaction is not None:
             self.source_interaction.enable_rates(self.eddy.motion)
 
-    def persistent_arrays(self) -> dict[str, wp.array]:
+    def persistent_arrays(self) -> dict[str, PersistentArray]:
         """Return by name the arrays that one solve passes to the next. Restoring them repeats the next solve."""
         parts = {"induction": solve_state.persistent_arrays(self._induction), "pairs": self._packed.persistent_arrays()}
         parts["dynamics"] = self.dynamics.persistent_arrays()

@@ -9,6 +9,7 @@ from warpmag.kernels.applied.fields import AppliedForces
 from warpmag.kernels.applied.near_cells import FACE_SPLIT, NearCellBody
 from warpmag.kernels.cells.cell_pairs import CellPairs
 from warpmag.kernels.cells.couplings import CellCouplings
+from warpmag.moments.arrays import PersistentArray
 from warpmag.moments.layout import MomentLayout
 from warpmag.shapes.demagnetization import Coupling, couplings_in_worlds
 from warpmag.shapes.face_charges import face_response
@@ -79,7 +80,7 @@ class SystemCells:
         if self.pairs is not None:
             self.pairs.request_search(chosen)
 
-    def persistent_arrays(self) -> dict[str, wp.array]:
+    def persistent_arrays(self) -> dict[str, PersistentArray]:
         """Return the arrays that one solve passes to the next, by name."""
         return {} if self.pairs is None else self.pairs.persistent_arrays()
 

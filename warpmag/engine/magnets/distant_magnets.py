@@ -19,6 +19,7 @@ from warpmag.kernels.rigid.distant import (
     WorldChoice,
 )
 from warpmag.kernels.shared.copies import put_copies
+from warpmag.moments.arrays import PersistentArray
 from warpmag.moments.ranks import current_ranks
 from warpmag.moments.resting_worlds import RestingWorlds
 from warpmag.moments.system import MomentSystem
@@ -257,7 +258,7 @@ class DistantMagnets:
         placed.system.apply_forces()
         placed.add_wrenches(self._model, state)
 
-    def persistent_arrays(self) -> dict[str, wp.array]:
+    def persistent_arrays(self) -> dict[str, PersistentArray]:
         """Return the arrays that the next solve and :meth:`add_forces` read, by name."""
         result = {name: getattr(self._choice, name) for name in ("level", "saturated", "acting")}
         result["poses"] = self._poses

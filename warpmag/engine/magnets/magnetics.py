@@ -38,6 +38,7 @@ from warpmag.kernels.rigid.worlds import number_worlds
 from warpmag.moments.arrays import (
     CallContext,
     Numbers,
+    PersistentArray,
     host_array,
     largest_coordinate,
 )
@@ -364,7 +365,7 @@ class Magnetics:
         levels = () if self._distant is None else self._distant.levels
         self.magnets = change_materials(self._values, (self._placed, *levels), self.magnets)
 
-    def persistent_arrays(self) -> dict[str, wp.array]:
+    def persistent_arrays(self) -> dict[str, PersistentArray]:
         """Return the arrays that the next step depends on, by name: values set by the user and the last solution."""
         attributes = getattr(self._model, NAMESPACE)
         values = {"magnetization": attributes.magnetization, "strength": attributes.strength}
@@ -373,7 +374,7 @@ class Magnetics:
             values |= {f"coils.{name}": array for name, array in self.coils.persistent_arrays().items()}
         return values | self._values.persistent_arrays() | self._solutions()
 
-    def _solutions(self) -> dict[str, wp.array]:
+    def _solutions(self) -> dict[str, PersistentArray]:
         """Return the arrays that solves pass to the next ones, by name."""
         few = {} if self._distant is None else self._distant.persistent_arrays()
         return self.system.persistent_arrays() | {f"few.{name}": array for name, array in few.items()}

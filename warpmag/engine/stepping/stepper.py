@@ -33,7 +33,7 @@ from warpmag.errors import InputError, SimulationError
 from warpmag.kernels.rigid import monitor, stepping
 from warpmag.kernels.rigid.bodies import predict_poses
 from warpmag.kernels.rigid.newton_views import view_bodies
-from warpmag.moments.arrays import restore_snapshot, snapshot_views
+from warpmag.moments.arrays import PersistentArray, restore_snapshot, snapshot_views
 
 TRAVEL_LIMIT = 0.25
 """Largest sliding along another body, or displacement by forces, in a substep, over the body's thickness; see
@@ -293,7 +293,7 @@ class Stepper:
         restore_snapshot(self._persistent_arrays(), saved)
         self.steps = self._reported = int(steps)
 
-    def _persistent_arrays(self) -> dict[str, wp.array]:
+    def _persistent_arrays(self) -> dict[str, PersistentArray]:
         """Return the arrays that the next step depends on, by name."""
         machine = {name: getattr(self._arrays, name) for name in ("status", "last_overlap")}
         parts = {"state": dict(enumerate(_arrays(self._state))), "machine": machine}
