@@ -17,7 +17,8 @@ the remainder heats a pile. In Sakura Tree, balls are held under 1,500 times the
 9 cm/s with substeps of 0.5 ms, and at 2 cm/s with 0.25 ms.
 
 **Forces** are shared by substeps as long as bodies move little compared with the distance over which their magnetic
-forces vary. In a sheet this distance is much longer than the thickness, by which contacts judge.
+forces vary. In a sheet this distance is much longer than the thickness, by which contacts judge. Far from all other
+magnets it is longer still (``force_spans``).
 """
 
 import warp as wp
@@ -61,7 +62,8 @@ class Monitor:
     # Distance that a body may move before it can pass through another [m], the radius of a ball; infinite for bodies
     # that forces do not move. Shape [body_count].
     thickness: wp.array[float]
-    force_length: wp.array[float]  # distance over which the magnetic force on a body varies [m]; infinite as above
+    force_length: wp.array[float]  # distance over which the force on a body in contact varies [m]; infinite as above
+    force_span: wp.array[float]  # distance over which the force on a body varies now [m], [body_count]
     reach: wp.array[float]  # largest displacement of a body's surface per radian [m], zero for a ball, [body_count]
     fill_counts: wp.array[wp.uint64]  # addresses of each buffer's number of used entries; 0 for :func:`watch_flags`
     level: wp.array[wp.int32]  # number of times that substeps were halved, shape [1]
@@ -104,11 +106,11 @@ def _raise_maximum(peaks: wp.array[float], index: int, value: float):
 
 
 @wp.func
-def _raise_travel(m: Monitor, travel: float, long_travel: float, length_ratio: float, substep: int):
-    """Raise the peaks of motion; ``length_ratio`` is the thickness over the distance in which forces vary."""
+def _raise_travel(m: Monitor, travel: float, long_travel: float, force_travel: float, substep: int):
+    """Raise the peaks of motion."""
     _raise_maximum(m.peaks, wp.where(substep == NEXT_SUBSTEP, PEAK_NEXT_TRAVEL, PEAK_TRAVEL), travel)
     _raise_maximum(m.peaks, PEAK_LONG_TRAVEL, long_travel)
-    _raise_maximum(m.peaks, PEAK_FORCE_TRAVEL, length_ratio * long_travel)
+    _raise_maximum(m.peaks, PEAK_FORCE_TRAVEL, force_travel)
 
 
 @wp.func
@@ -126,8 +128,10 @@ def _watch_body(m: Monitor, bodies: BodyView, body: int, substep: int, dt: float
     if thickness < wp.inf:
         speed = wp.length(wp.spatial_top(bodies.qd[body]))
         turning = m.reach[body] * wp.length(wp.spatial_bottom(bodies.qd[body]))
-        travel = UNCONSTRAINED_WEIGHT * (speed + turning) * dt / thickness
-        _raise_travel(m, travel, 2.0 * travel, thickness / m.force_length[body], substep)
+        weighted_time = UNCONSTRAINED_WEIGHT * dt
+        travel = weighted_time * (speed + turning) / thickness
+        force_travel = 2.0 * weighted_time * (speed / m.force_span[body] + turning / m.force_length[body])
+        _raise_travel(m, travel, 2.0 * travel, force_travel, substep)
         _raise_maximum(m.peaks, PEAK_SPEED, speed)
 
 
@@ -174,7 +178,8 @@ def _watch_contact(
     along = wp.length(moved - apart * contacts.normal[i])
     closes, closes_later = apart < overlap, 2.0 * apart < overlap
     ratio = thickness / wp.min(_body_length(m.force_length, body0), _body_length(m.force_length, body1))
-    _raise_travel(m, wp.where(closes, along, 0.0), wp.where(closes_later, 2.0 * along, 0.0), ratio, substep)
+    long_travel = wp.where(closes_later, 2.0 * along, 0.0)
+    _raise_travel(m, wp.where(closes, along, 0.0), long_travel, ratio * long_travel, substep)
 
 
 @wp.kernel
@@ -233,7 +238,7 @@ def _watch_forces(m: Monitor, bodies: BodyView, gravity_in: wp.array[wp.vec3], l
             pull = 0.5 * acceleration * dt * dt / thickness
             _raise_maximum(m.peaks, PEAK_TRAVEL, pull)
             _raise_maximum(m.peaks, PEAK_LONG_TRAVEL, 4.0 * pull)
-            _raise_maximum(m.peaks, PEAK_FORCE_TRAVEL, 4.0 * pull * thickness / m.force_length[body])
+            _raise_maximum(m.peaks, PEAK_FORCE_TRAVEL, 4.0 * pull * thickness / m.force_span[body])
 
 
 def watch_forces(m: Monitor, bodies: BodyView, gravity, longest: float):

@@ -303,6 +303,7 @@ class StepMachine:
         m.thickness, m.force_length, m.reach = (
             wp.array(values, dtype=float, device=a.status.device) for values in (thickness, force_length, reach)
         )
+        m.force_span = wp.clone(m.force_length)
         m.fill_counts = wp.zeros(len(a.capacities), dtype=wp.uint64, device=a.status.device)
         m.level = a.status[STATUS_LEVEL : STATUS_LEVEL + 1]
         m.substeps = a.status[STATUS_SUBSTEPS : STATUS_SUBSTEPS + 1]

@@ -214,6 +214,11 @@ class Magnetics:
         """True if forces depend on velocities, ``State.body_qd``, because a magnet conducts."""
         return self.system.eddy is not None
 
+    @property
+    def has_sources(self) -> bool:
+        """True if coils or field maps act on the magnets."""
+        return bool(self._sources.applied)
+
     def field_error(self) -> float:
         """Return the relative error of the last field that the fast multipole method summed; 0 for direct sums.
 

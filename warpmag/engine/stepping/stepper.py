@@ -32,6 +32,7 @@ from warpmag.engine.stepping.state_rows import state_rows
 from warpmag.errors import InputError, SimulationError
 from warpmag.kernels.rigid import monitor, stepping
 from warpmag.kernels.rigid.bodies import predict_poses
+from warpmag.kernels.rigid.force_spans import magnetic_shapes, measure_force_spans
 from warpmag.kernels.rigid.newton_views import view_bodies
 from warpmag.moments.arrays import PersistentArray, restore_snapshot, snapshot_views
 
@@ -116,6 +117,8 @@ class Stepper:
         )
         self._arrays = self._machine.arrays
         self._watched = self._machine.make_monitor(sizes.thickness, sizes.force_length, sizes.reach)
+        # the field of a coil or map may vary over a short distance anywhere
+        self._magnets = None if magnetics.has_sources else magnetic_shapes(model, magnetics.shapes)
         self._mirrors = {name: getattr(self._arrays, name) for name in ("status", "peaks", "counts", "log")}
         if self._device.is_cuda:
             copies = {name: wp.empty_like(array, device="cpu", pinned=True) for name, array in self._mirrors.items()}
@@ -296,6 +299,7 @@ class Stepper:
     def _persistent_arrays(self) -> dict[str, PersistentArray]:
         """Return the arrays that the next step depends on, by name."""
         machine = {name: getattr(self._arrays, name) for name in ("status", "last_overlap")}
+        machine["force_span"] = self._watched.force_span
         parts = {"state": dict(enumerate(_arrays(self._state))), "machine": machine}
         parts["control"] = dict(enumerate(_arrays(self._control)))
         parts |= {"magnetics": self._magnetics.persistent_arrays(), "solver": self._solver.persistent_arrays()}
@@ -390,8 +394,7 @@ class Stepper:
     def _share_forces(self, dt: float) -> None:
         """Evaluate the forces that the next substeps of ``dt`` [s] share, at predicted poses."""
         predict_poses(view_bodies(self._model, self._state), self._machine.sharing, dt, self._shared.body_q)
-        if self._magnetics.needs_velocities:
-            wp.copy(self._shared.body_qd, self._state.body_qd)
+        wp.copy(self._shared.body_qd, self._state.body_qd)
         if self._keyed_values:
             self._keyed_values.set_values(0.0, shared=self._machine.sharing, substep=dt)
         self._magnetize(self._shared, dt, sharing=self._machine.sharing)
@@ -404,6 +407,8 @@ class Stepper:
         monitor.watch_induction(self._watched, magnetics.error, magnetics.evaluations, magnetics.converged)
         magnetics.add_forces(state)
         bodies = view_bodies(self._model, state)
+        if self._magnets is not None:
+            measure_force_spans(self._watched, bodies, self._magnets, self._longest)
         monitor.watch_forces(self._watched, bodies, self._model.gravity, self._longest)
 
 
