@@ -16,7 +16,7 @@ from warpmag.kernels.shared.pieces import cut
 from warpmag.kernels.shared.reductions import block_max, block_sum, fence
 
 DEPTH = 5  # changes between iterates that are stored and mixed (``anderson.h``)
-COLUMNS = 8 + DEPTH + DEPTH * (DEPTH + 1) // 2  # sums over the moments of a chunk or world; as in ``theta_step.h``
+COLUMNS = 9 + DEPTH + DEPTH * (DEPTH + 1) // 2  # sums over the moments of a chunk or world; as in ``theta_step.h``
 BLOCK_CHUNK = 128  # moments in a chunk on a GPU, one per thread of a block; on a CPU a chunk has ``native.CHUNK``
 _CHUNK_SIZES = 4, 32, BLOCK_CHUNK
 """Sizes for which the blocks of a GPU are made. Blocks for whole chunks would be mostly idle in small worlds."""
@@ -96,6 +96,7 @@ def state_type(dtype):
         sums: wp.array2d[wp.float64]  # sums of each chunk, on a CPU of each vector, shape [c, COLUMNS]
         arrived: wp.array[int]  # number of each world's chunks whose sums are complete, shape [w]
         worlds: wp.array[World]  # state of each world, shape [w]
+        has_cells: wp.array[int]  # 1 for worlds with bodies of cells, shape [w]
         resting: wp.array[int]  # 1 for worlds that solves leave out, shape [w]
         warm: wp.array[int]  # number of solves of each world since its cold start, at most ``STEADY``, shape [w]
         residual: wp.array[wp.float64]  # ‖M − f(H)‖/‖f(H)‖ of each world after its last evaluation, shape [w]
@@ -107,17 +108,19 @@ def state_type(dtype):
     return SolveState
 
 
-def allocate(worlds, inducible, dtype, device, copies: int = 1):
+def allocate(worlds, inducible, cells, dtype, device, copies: int = 1):
     """Allocate the state of a solve; :func:`bind` sets the arrays that it shares.
 
-    The worlds of the moments do not decrease. In each world inducible moments come first. The state has ``copies`` of
-    these worlds.
+    The worlds of the moments do not decrease. In each world inducible moments come first. ``cells`` is True for the
+    cells of bodies. The state has ``copies`` of these worlds.
     """
     on_cpu = wp.get_device(device).is_cpu
     n, size = copies * len(worlds), CHUNK if on_cpu else BLOCK_CHUNK
     rows, chunks, chunk_begin = _rows_and_chunks(worlds, inducible, size, copies)
     row_count, world_count, count = copies * len(rows[0]), len(chunk_begin) - 1, len(chunks)
     vec3, vectors = wp.types.vector(3, dtype), CHUNK // (64 // wp.types.type_size_in_bytes(dtype)) if on_cpu else 1
+
+    has_cells = np.bincount(worlds, cells, minlength=world_count // copies) > 0
 
     def put(values, kind):
         return wp.array(np.asarray(values, np.int32), dtype=kind, device=device)
@@ -129,6 +132,7 @@ def allocate(worlds, inducible, dtype, device, copies: int = 1):
         "row": put_copies(rows[0], wp.vec4i, device, copies, rows[1]),
         "chunk": put(chunks, wp.vec3i),
         "chunk_begin": put(chunk_begin, wp.int32),
+        "has_cells": put_copies(has_cells.astype(np.int32), wp.int32, device, copies),
         "converged": put(np.ones(world_count), wp.int32),  # worlds without inducible moments count as converged
         **zeros("near", (count if on_cpu else 0, CAPACITY, CHUNK)),
         **zeros("near_count", count * vectors),

@@ -273,6 +273,8 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     const Wide merit = weight * wide(length(r));
     put(DEVIATION, deviation * deviation);
     put(GOAL, goal * goal);
+    const Number share = induced_share(material);
+    put(WORK, wide(share * share) * square * wide_dot(s, material.slope / material.saturation * get(state.h0, at)));
     const Wide left = merit * wide(2 - whole_step<Real>(step_of(state, at)));
     put(MERIT, merit * merit);
     put(LEFT, left * left);

@@ -37,6 +37,16 @@ allows the same error again. So the estimate amplifies the residual (Eq. 12) of 
 
 with λ = ‖φ (2 − ω₁) r‖/‖φ r‖. The mixtures of long solves leave slow modes in r̄, so that λ is at least γ there.
 
+Inside a body of iron, closed loops of magnetization have almost no field. A residual hardly tells of them, and nothing
+outside depends on them. So in worlds with bodies of cells the error is that in the energy norm. Let a be the factor
+above, max(1, …), and b = k H0/Ms the reduced applied field:
+
+    error = max(‖M − f(H)‖/‖f(H)‖, ‖M − f(H)‖ √(a/⟨φ s, φ b⟩)).
+
+The energy norm of an error e is √⟨e, r⟩ ≤ √a ‖r‖, and ⟨s, b⟩ is the square of that of the solution. If a slow mode
+dominates the solution, as in a long bar along the field, this is the error of the magnetization. For a steel plate of
+60 × 60 × 3 mm that moves at a magnet, solves take 10 evaluations in place of 57, and forces have errors of 1e-4.
+
 With slow convergence many steps like the last one remain. The factor σ is their geometric series ρ/(1 − ρ), and at
 least 1, with ρ the ratio of ‖φ r‖ to its smallest earlier value. At least half of σ is kept at the next evaluation. The
 error is at least a hundredth of the last ‖φ Δs‖, since sweeps over near contacts lag behind the moments. Rounding is

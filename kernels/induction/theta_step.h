@@ -14,9 +14,9 @@ constexpr double REMEMBERED = 0.5;     // fraction of the slowness that is kept 
 constexpr double DISTINCT = 0.01; // least change of the residual between mixtures, as a fraction of the last change
 constexpr double ROUNDING = 8.0 * (sizeof(Real) == 4 ? 1.2e-7 : 2.2e-16); // residual at rounding level
 
-// Sums over the moments of a chunk or a world: ‖M − f(H)‖², ‖f(H)‖², ‖φr‖², ‖φ(2 − ω₁)r‖², ‖φΔs‖² of the last
-// change and of the one before, ⟨φΔg, φΔg'⟩, ‖φΔg'‖², and the products of anderson.h.
-enum Column { DEVIATION, GOAL, MERIT, LEFT, CHANGE, FORMER, FOLLOWED, EARLIER, PRODUCTS };
+// Sums over the moments of a chunk or a world: ‖M − f(H)‖², ‖f(H)‖², ⟨φs, φb⟩ with b the applied field, ‖φr‖², ‖φ(2 −
+// ω₁)r‖², ‖φΔs‖² of the last change and of the one before, ⟨φΔg, φΔg'⟩, ‖φΔg'‖², and the products of anderson.h.
+enum Column { DEVIATION, GOAL, WORK, MERIT, LEFT, CHANGE, FORMER, FOLLOWED, EARLIER, PRODUCTS };
 constexpr int COLUMNS = PRODUCTS + DEPTH + DEPTH * (DEPTH + 1) / 2; // as in solve_state.py
 
 // Convergent step length ω = κ/k of a moment with stiffness k (2/3 + o_i), in scalars S.
@@ -123,6 +123,13 @@ CUDA_CALLABLE inline double amplification(const World& world, const double* sums
     return error > 1.0 ? error : 1.0;
 }
 
+// Error of a solution whose residual is amplified by a factor: of the magnetization, or with cells in the energy norm.
+CUDA_CALLABLE inline double solution_error(bool has_cells, const double* sums, double residual, double factor) {
+    if (!has_cells || !(sums[WORK] > 0.0)) return factor * residual;
+    const double energy = wp::sqrt(factor * sums[DEVIATION] / sums[WORK]);
+    return energy > residual ? energy : residual;
+}
+
 // Chooses a world's next step from its sums.
 template <class State> CUDA_CALLABLE inline void choose_step(State& state, int w, const double* sums) {
     auto& world = state.worlds.data[w];
@@ -133,7 +140,8 @@ template <class State> CUDA_CALLABLE inline void choose_step(State& state, int w
     update_estimates(world, history, sums, merit);
     const bool mixed = mix(world, history, sums, merit, finite);
     const double factor = residual > ROUNDING ? amplification(world, sums, merit, mixed) : 1.0;
-    const bool done = check_convergence(state, w, residual, factor * residual, finite, failed);
+    const double error = solution_error(state.has_cells.data[w], sums, residual, factor);
+    const bool done = check_convergence(state, w, residual, error, finite, failed);
     if (done) {
         const double followed = sums[EARLIER] > 0.0 ? sums[FOLLOWED] / sums[EARLIER] : 0.0;
         world.ahead = followed < 0.0 ? 0.0 : followed > 1.0 ? 1.0 : followed;

@@ -188,7 +188,7 @@ class MomentSystem:
             groups=put_copies(layout.worlds.astype(np.int32), wp.int32, self.device, copies, layout.world_count),
         )
         self._effective = self._packed.vectors()
-        arguments = layout.worlds, ~layout.permanent, self.dtype, self.device, copies
+        arguments = layout.worlds, ~layout.permanent, layout.cells, self.dtype, self.device, copies
         self._induction = state = solve_state.allocate(*arguments)
         self.h, self.residual, self.error, self.resting = state.h, state.residual, state.error, state.resting
         self.evaluations, self.converged = state.evaluations, state.converged
