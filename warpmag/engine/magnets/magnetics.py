@@ -119,7 +119,8 @@ class Magnetics:
                 34 % at a gap of 0.3 radii, by 93 % at 0.01.
             method: Summation of fields and forces: ``direct`` over all pairs, ``fmm`` by the fast multipole method
                 with an error within ``rtol``, or ``auto`` for the faster one.
-            rtol: Relative magnetization error at which the induction solve ends.
+            rtol: Relative magnetization error at which the induction solve ends: with bodies of cells, in the energy
+                norm.
             external_field: Uniform applied field H0 [A/m], world frame. By default the option ``magnetic`` of an
                 imported MJCF, B/μ0, with a warning; else none.
             max_evaluations: Field evaluations after which an unconverged induction solve ends.
@@ -191,7 +192,11 @@ class Magnetics:
 
     @property
     def error(self) -> wp.array:
-        """Relative magnetization error of the last solve, on the device, shape [worlds with magnets]."""
+        """Relative magnetization error of the last solve, on the device, shape [worlds with magnets].
+
+        In worlds with bodies of cells, such as plates and bars, it is the error in the energy norm: closed loops of
+        magnetization inside iron, which have no field, hardly count.
+        """
         return self.system.error
 
     @property
