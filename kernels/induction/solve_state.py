@@ -54,8 +54,7 @@ def state_type(dtype):
     class SolveState:
         packed: wp.array2d[dtype]  # moments, shape [8, n]; inducible ones are written
         moments: wp.array[vec3]  # the same [A·m²], shape [n]
-        # Lists of neighbors (``PackedMoments``):
-        neighbor: wp.array2d[int]
+        neighbor: wp.array2d[int]  # lists of neighbors (``PackedMoments``)
         neighbor_count: wp.array[int]
         overlap: wp.array2d[int]
         overlap_count: wp.array[int]
