@@ -31,8 +31,9 @@ COMMAND = re.compile(r"^(?:pip install uv && uv run )?(warpmag .*)$", re.MULTILI
 SLOW = (
     "physics.md",
     *(f"physics/{name}.md" for name in ("equilibrium", "uniqueness", "forces", "bodies", "near_bodies", "coils")),
-    *(f"howto/{name}.md" for name in ("coils", "design", "energy", "gradients", "holding")),
-    *(f"howto/{name}.md" for name in ("material", "mujoco", "newton", "switch")),
+    *(f"physics/{name}.md" for name in ("curves", "eddy")),
+    *(f"howto/{name}.md" for name in ("coils", "design", "energy", "gradients", "holding", "holding_solvers")),
+    *(f"howto/{name}.md" for name in ("material", "mujoco", "newton", "simulation", "switch", "voltages", "workload")),
     *(f"tutorials/{name}.md" for name in ("blender", "coils", "robot")),
 )
 """Pages that take long, most of them to compile kernels that no other test needs; ``.ci/run`` runs them, too."""
