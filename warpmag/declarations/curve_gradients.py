@@ -1,6 +1,6 @@
 """Derivatives of measured magnetization curves with respect to their points.
 
-Between two points M is Hermite's cubic of their magnetizations and slopes, beyond the last point M = Ms − D²/z with
+Between two points M is Hermite's cubic of their magnetizations and slopes. Beyond the last point M = Ms − D²/z with
 D = Ms − M_n and z = D + M'_n (H − H_n) (``curves.py``). Slopes and Ms follow from the points, so each chain of
 derivatives ends there.
 """
@@ -14,8 +14,8 @@ from warpmag.errors import InputError
 def point_gradients(curve: MagnetizationCurve, ball_fields, weights) -> tuple[np.ndarray, np.ndarray]:
     """Return the gradients of Σ w M of balls with respect to fields and magnetizations of the points of a curve.
 
-    A change δM of the curve changes the magnetization of a ball in a fixed field of all others by δM/(1 + M'/3),
-    because its own field −M/3 changes, too.
+    A change δM of the curve changes the magnetization of a ball by δM/(1 + M'/3) at a fixed field of all others. The
+    reason is the ball's own field −M/3, which changes, too.
 
     Args:
         curve: Curve with extrapolated saturation.

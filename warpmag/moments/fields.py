@@ -76,8 +76,8 @@ def h_field(
         H [A/m], shape [t, 3], as NumPy array, or as Warp array of vectors if ``positions`` is a Warp array.
 
     Raises:
-        InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (the
-            message has the limits), or the result is not finite. Or a tape is active, and an argument requires a
+        InputError: An argument has a wrong shape, contains no real numbers or is out of range of ``dtype``; the message
+            names the limits. Or the result is not finite. Or a tape is active, and an argument requires a
             gradient that does not exist.
 
     Example:
@@ -166,8 +166,8 @@ def wrench(
         Forces [N] and torques about each moment's position [N·m], each of shape [n, 3], NumPy or Warp as ``positions``.
 
     Raises:
-        InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (the
-            message has the limits), or a result is not finite. Or a tape is active, and an argument requires a
+        InputError: An argument has a wrong shape, contains no real numbers or is out of range of ``dtype``; the message
+            names the limits. Or a result is not finite. Or a tape is active, and an argument requires a
             gradient that does not exist.
 
     Example:

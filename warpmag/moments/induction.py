@@ -212,8 +212,8 @@ def solve_induction(
         The equilibrium, an :class:`InductionResult`.
 
     Raises:
-        InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (the
-            message has the limits), or the result is not finite. Or a tape is active, and an argument requires a
+        InputError: An argument has a wrong shape, contains no real numbers or is out of range of ``dtype``; the message
+            names the limits. Or the result is not finite. Or a tape is active, and an argument requires a
             gradient that does not exist.
 
     Warns:
