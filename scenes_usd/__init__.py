@@ -7,7 +7,7 @@ from pathlib import Path
 from warpmag.errors import InputError
 
 _SUFFIXES = (".usd", ".usda", ".usdc")
-MADE = ("million",)
+GENERATED_SCENES = ("million",)
 """Scenes too large to be bundled: they are authored on demand."""
 
 
@@ -17,7 +17,7 @@ def bundled() -> dict[str, Path]:
 
 
 def summary(name: str) -> str:
-    """Return a description of a scene of :data:`MADE` in one line."""
+    """Return a description of a scene of :data:`GENERATED_SCENES` in one line."""
     return (inspect.getdoc(_module(name)) or "").partition("\n")[0].rstrip(".")
 
 
@@ -25,7 +25,7 @@ def make(name: str, folder: Path, balls: int | None = None) -> Path:
     """Author a scene with a chosen number of balls.
 
     Args:
-        name: A bundled scene, or one of :data:`MADE`.
+        name: A bundled scene, or one of :data:`GENERATED_SCENES`.
         folder: Folder of the file.
         balls: The number of balls; None means the scene's own.
 

@@ -22,7 +22,7 @@ MANY = {"cpu": 1001, "cuda": 400_000}
 def main(what: str, *arguments: str) -> int:
     """Do it, with all sums shared out, and say on stderr how often they were merged; return the exit code."""
     wp.config.enable_backward = False  # as the tests do, so that both find the same compiled kernels
-    evaluate._LEAST_SHARED = dict.fromkeys(evaluate._LEAST_SHARED, 1)
+    evaluate._FEWEST_PAIRS_OF_RANKS = dict.fromkeys(evaluate._FEWEST_PAIRS_OF_RANKS, 1)
     all_ranks, merged = current_ranks(), []
     if all_ranks is not None:
         merge = all_ranks.merge
@@ -79,7 +79,7 @@ def several_worlds(sizes: list[int], device: str | None) -> np.ndarray:
 
 
 def differ() -> None:
-    """Print the errors that this rank gets where ranks are told different things, a line each."""
+    """Print the errors that this rank gets if arguments differ between ranks, one line each."""
     rank, x = current_ranks().rank, np.eye(3)
     model = small_scene(1e6 + rank).finalize(device="cpu")
     tries = {

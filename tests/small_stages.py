@@ -64,8 +64,8 @@ def write(folder, *parts):
     return path
 
 
-def told(path, folder, device, capsys, frames=2):
-    """Errors and warnings of ``check`` and ``run``; both commands end alike."""
+def errors_and_warnings(path, folder, device, capsys, frames=2):
+    """Return the errors and the warnings of ``check``, after a test that ``run`` reports the same."""
     capsys.readouterr()
     code = cli.main(["check", str(path)])
     lines = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]

@@ -230,7 +230,7 @@ def warp_vectors(values, device, dtype=None):
 
 
 def test_warp_arrays(device):
-    """Strided, indexed and of other precision: right. NaN, another type, shape or range: told."""
+    """Strided and indexed arrays, and those of another precision, work. NaN, other types and shapes raise errors."""
     import warp as wp  # noqa: PLC0415
 
     expected = call("wrench", device)

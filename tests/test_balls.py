@@ -138,9 +138,9 @@ def test_none_is_none():
 def test_wrong_arguments_are_one_clear_line_and_add_nothing(change, message):
     builder = _builder()
     given = {"builder": builder, "positions": np.zeros((2, 3)), "radius": 0.005} | change
-    with pytest.raises(InputError, match=message) as told:
+    with pytest.raises(InputError, match=message) as error:
         warpmag.add_balls(given.pop("builder"), given.pop("positions"), given.pop("radius"), **given)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(error.value)
     assert (builder.body_count, builder.shape_count) == (1, 1)
 
 

@@ -257,7 +257,7 @@ def test_processes_share_out_the_sums(form, count, launches, monkeypatch):
     whole.launch()
     alone = launches[0].threads
     launches.clear()
-    monkeypatch.setitem(evaluate._LEAST_SHARED, "cuda", 1)
+    monkeypatch.setitem(evaluate._FEWEST_PAIRS_OF_RANKS, "cuda", 1)
     half = evaluation(Quantity.FIELD, count, form=form, extra_parts=form == LOOP, ranks=(ranks := Half()))
     half.launch()
     if form == FUSED:
@@ -373,7 +373,7 @@ def test_systems_of_two_processes(which, launches, monkeypatch):
     for module in (system, fmm):
         monkeypatch.setattr(module, "current_ranks", lambda: ranks)
     monkeypatch.setattr(sharing, "_LEAST_BOXES", {"cuda": 1})
-    monkeypatch.setattr(evaluate, "_LEAST_SHARED", {"cuda": 1})
+    monkeypatch.setattr(evaluate, "_FEWEST_PAIRS_OF_RANKS", {"cuda": 1})
     monkeypatch.setattr(mirror_cuda, "_SLAB_BYTES", 2**20)
     drive(which, "float64")
     names = {launch.name for launch in launches}

@@ -127,8 +127,8 @@ def test_ends_of_a_joint_that_are_apart_close_slowly(device):
     builder.body_q[bar] = wp.transform((0.3, 0.0, 0.2), wp.quat_identity())
     simulation = Simulation(builder, device=device, dt=STEP)
     gap = math.hypot(0.3 - EXTENT[0], 0.2)
-    (told,) = simulation.warnings()
-    assert told.startswith(f"{builder.joint_label[-1]}: its ends are {gap:.3g} m apart at the start")
+    (warning,) = simulation.warnings()
+    assert warning.startswith(f"{builder.joint_label[-1]}: its ends are {gap:.3g} m apart at the start")
     apart, spins = [], []
     for _ in range(400):
         simulation.step()

@@ -93,8 +93,8 @@ FAULTS = {
 def test_faults_are_one_line(line, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["examples", *FAULTS[line]])
     assert examples.main() == (1 if "check" in line else 2)
-    (told,) = capsys.readouterr().err.splitlines()
-    assert told.startswith(f"warpmag: {line}")
+    (message,) = capsys.readouterr().err.splitlines()
+    assert message.startswith(f"warpmag: {line}")
 
 
 def test_a_full_standard_output_is_one_line():

@@ -287,11 +287,11 @@ def test_a_mesh_may_be_a_body_itself(tmp_path):
         ("scene.usda/new.usda", {}, "cannot be written"),
     ],
 )
-def test_what_cannot_be_exported_is_told_in_a_line(run, output, options, message):
+def test_invalid_exports_raise_an_error_of_one_line(run, output, options, message):
     before = sorted(os.listdir(run.parent))
-    with pytest.raises(InputError, match=message) as told:
+    with pytest.raises(InputError, match=message) as error:
         export(run, run.parent / output, **options)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(error.value)
     assert sorted(os.listdir(run.parent)) == before
 
 
@@ -305,7 +305,7 @@ def test_a_run_for_renderers(tmp_path, device, capsys):
     assert "color          force, from 0 to" in capsys.readouterr().out
 
 
-def test_a_finished_picture_that_cannot_be_is_told_in_a_line(run, monkeypatch):
+def test_an_invalid_finished_picture_raises_an_error_of_one_line(run, monkeypatch):
     monkeypatch.setenv("WARPMAG_BLENDER", str(run.with_name("no_python")))
     command = ["render", str(run), "--quality", "final", "-o"]
     for arguments, message in (

@@ -206,7 +206,7 @@ def test_a_run_of_a_scene_of_another_number_of_balls(device, tmp_path, capsys):
     assert "--balls is for bundled scenes" in capsys.readouterr().err
 
 
-def test_a_scene_that_cannot_be_made_is_told_in_one_line(tmp_path, capsys):
+def test_an_invalid_generated_scene_prints_one_line(tmp_path, capsys):
     (tmp_path / "file").write_text("no folder")
     for balls, folder, reason in (
         (3, "file", f"{tmp_path}/file/million_3.usdc: cannot be written (File exists)"),

@@ -41,7 +41,7 @@ def write(model, name, shape, value):
 
 
 def stepped(magnetics, model):
-    """Forces at the poses of the model; a change is told at the latest when the device is waited for."""
+    """Return the forces at the poses of the model; a change raises an error here at the latest."""
     state = model.state()
     magnetics.apply(state)
     magnetics.check_model()
@@ -74,7 +74,7 @@ def test_a_shape_that_becomes_a_magnet_is_noticed(device):
 
 
 @pytest.mark.parametrize("captured", [False, True])
-def test_a_material_that_was_told_of_counts(device, captured):
+def test_a_notified_material_takes_effect(device, captured):
     """As if the model had been made with it, also in a graph that was captured before."""
     material = {"saturation": 3e5, "susceptibility": 8.0}
     model = model_of(device)

@@ -150,12 +150,14 @@ def test_wheel_installs_the_command_and_nothing_at_top_level(wheel):
 
 def test_metadata(wheel):
     (info,) = wheel.glob("*.dist-info")
-    told = email.message_from_string((info / "METADATA").read_text())
-    assert told["Version"] == warpmag.__version__ == metadata.version("warpmag")
-    assert told["License-Expression"] == "Apache-2.0"
-    assert told["Author"] == "warpmag contributors"
-    assert "Project-URL" not in told
-    assert {f"Programming Language :: Python :: {python}" for python in PYTHONS} <= set(told.get_all("Classifier"))
+    metadata_of_wheel = email.message_from_string((info / "METADATA").read_text())
+    assert metadata_of_wheel["Version"] == warpmag.__version__ == metadata.version("warpmag")
+    assert metadata_of_wheel["License-Expression"] == "Apache-2.0"
+    assert metadata_of_wheel["Author"] == "warpmag contributors"
+    assert "Project-URL" not in metadata_of_wheel
+    assert {f"Programming Language :: Python :: {python}" for python in PYTHONS} <= set(
+        metadata_of_wheel.get_all("Classifier")
+    )
     assert (info / "licenses" / "LICENSE").read_text() == (ROOT / "LICENSE").read_text()
 
 
@@ -190,8 +192,8 @@ def test_wheel_works_on_each_python(version, archive, tmp_path):
     place = tmp_path / "fresh" / "bin"
     printed([uv(), "pip", "install", "--quiet", "--python", place / "python", archive], tmp_path)
     balls_up.author(tmp_path / "small.usda", columns=2, rows=2, layers=1)
-    told = printed([place / "warpmag", "run", "small.usda", "--frames", "1", "--device", "cpu"], tmp_path)
-    assert told[0].split() == ["magnets", "4", "moving"]
+    lines = printed([place / "warpmag", "run", "small.usda", "--frames", "1", "--device", "cpu"], tmp_path)
+    assert lines[0].split() == ["magnets", "4", "moving"]
 
 
 def test_import_is_light_and_comes_from_the_wheel(environment, tmp_path):

@@ -97,7 +97,7 @@ def test_a_page_orbits_and_plays_in_a_browser(stage, tmp_path, capsys):
         assert all(url.startswith(("file:", "data:", "blob:")) for url in page.requests) and page.requests
 
 
-def test_a_page_that_cannot_be_is_told_in_a_line(stage, tmp_path, monkeypatch):
+def test_an_invalid_page_raises_an_error_of_one_line(stage, tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"cannot be written"):
         export(stage, stage / "page.html")
     real = builtins.__import__

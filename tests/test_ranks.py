@@ -75,7 +75,7 @@ def test_worlds_of_a_sweep_are_each_its_own(calls):
     assert (poses[:, 0, 2] != poses[0, 0, 2]).sum() == 4  # in another field a ball is pulled otherwise
 
 
-def test_a_difference_is_told_in_one_line_on_all_ranks(calls):
+def test_a_difference_raises_an_error_of_one_line_on_all_ranks(calls):
     given = "differs between rank 1 and rank 0; the ranks of one calculation need equal arguments"
     lines = {
         "h_field": f"positions: {given}",
@@ -99,7 +99,7 @@ def test_a_difference_is_told_in_one_line_on_all_ranks(calls):
 def test_a_run_by_two_ranks_writes_the_bits_of_one(tmp_path, device, sums):
     from warpmag.scenes_usd import bundled, sakura_tree  # noqa: PLC0415
 
-    scene, told = tmp_path / "scene.usdc", []
+    scene, runs = tmp_path / "scene.usdc", []
     if device == "cpu":
         shutil.copyfile(bundled()["balls_up"], scene)
     else:  # as many as a GPU shares out
@@ -109,10 +109,10 @@ def test_a_run_by_two_ranks_writes_the_bits_of_one(tmp_path, device, sums):
         command = [SCRIPT, "run", scene, "-o", out, "--frames", 1, "--method", sums]
         done = start(ranks, *command, *([] if "cuda" in device else ["--device", device]))
         assert done.returncode == 0, done.stderr
-        told.append(done)
+        runs.append(done)
     # fields and forces of substeps; of a GPU those that are captured
-    assert merged(told[0]) == [0] and min(merged(told[1])) > (30 if device == "cpu" else 0)
-    assert told[0].stdout.count("\n") == told[1].stdout.count("\n")  # rank 0 alone tells of it
+    assert merged(runs[0]) == [0] and min(merged(runs[1])) > (30 if device == "cpu" else 0)
+    assert runs[0].stdout.count("\n") == runs[1].stdout.count("\n")  # only rank 0 prints
     first, second = ((tmp_path / f"{ranks}" / "out.cache.usdc").read_bytes() for ranks in (1, 2))
     assert first == second
 
@@ -144,7 +144,7 @@ def test_a_rank_that_ends_leaves_none_waiting(end, line):
     "output, line",
     [("", "no such file"), pytest.param("/proc/out.usda", "rank 0: /proc/out.usda", marks=pytest.mark.long)],
 )
-def test_a_failure_is_told_in_one_line(output, line, tmp_path):
+def test_a_failure_prints_one_line(output, line, tmp_path):
     command = ["-m", "warpmag.cli", "run", tmp_path / "no.usda" if not output else "falling_magnet", "--device", "cpu"]
     done = start(2, *command, *(["-o", output] if output else []))
     assert done.returncode == 2

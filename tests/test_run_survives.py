@@ -286,7 +286,7 @@ def test_what_is_written_of_a_scene_edited_in_memory_has_the_edits(kind, scene, 
     layer.Reload(force=True)
 
 
-def test_what_cannot_be_resumed_is_told_in_one_line(scene, tmp_path, device, always, capsys):
+def test_an_invalid_resume_prints_one_line(scene, tmp_path, device, always, capsys):
     output = tmp_path / "out.usda"
     Simulation(scene, device=device).run(6, output=output, on_frame=lambda frame: frame < 3)
     other = tmp_path / "other.usda"

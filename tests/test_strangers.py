@@ -310,8 +310,8 @@ def test_a_signal_during_an_import(name, tmp_path):
     )
     command = [sys.executable, "-c", program, str(tmp_path)]
     result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    told = "interrupted" if name == "SIGINT" else f"ended by {name}"
-    assert (result.returncode, result.stderr, result.stdout) == (128 + number, f"warpmag: {told}\n", "")
+    reason = "interrupted" if name == "SIGINT" else f"ended by {name}"
+    assert (result.returncode, result.stderr, result.stdout) == (128 + number, f"warpmag: {reason}\n", "")
 
 
 def test_an_interrupt_while_the_command_is_imported():

@@ -254,7 +254,7 @@ def test_a_coil_that_keys_move_without_a_body_follows_them(tmp_path, device):
         np.testing.assert_allclose(field, [0.0, 0.0, 100.0 / 0.08], atol=5.0)  # the ball adds a little
 
 
-def test_attributes_for_nothing_are_told(tmp_path):
+def test_attributes_without_effect_cause_warnings(tmp_path):
     lone = 'def Xform "Lone" {\nfloat warpmag:fieldMap:factor = 2\n}'
     report = check(write(tmp_path, coil("float warpmag:coil:radius = 1", "float warpmag:coil:ampereturns = 5"), lone))
     messages = [str(finding) for finding in report.warnings if "no effect" in str(finding)]

@@ -466,14 +466,14 @@ def test_a_moment_of_an_impossible_magnetization(device, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "told"),
+    ("name", "value", "cause"),
     [
         ("external field", (0.0, 1e9, 0.0), r"an applied field of 1e\+09 A/m"),
         ("magnetization", (0.0, 0.0, 1e38), r"a magnetization of 1e\+38 A/m"),
         ("strength", 1e28, r"a coil's current \[A\] or a field map's factor of 1e\+28"),
     ],
 )
-def test_a_run_that_ends_names_a_strength_beyond_all_measure(device, tmp_path, monkeypatch, name, value, told):
+def test_a_run_that_ends_names_a_strength_beyond_all_measure(device, tmp_path, monkeypatch, name, value, cause):
     simulation = Simulation(write(tmp_path, ball()), device=device)
     if name == "external field":
         simulation.magnetics.set_external_field(value)
@@ -484,7 +484,7 @@ def test_a_run_that_ends_names_a_strength_beyond_all_measure(device, tmp_path, m
         raise SimulationError("step 1: /Ball has left")
 
     monkeypatch.setattr(simulation._stepper, "read_reports", end)
-    with pytest.raises(SimulationError, match=rf"/Ball has left; {told} moves magnets too fast"):
+    with pytest.raises(SimulationError, match=rf"/Ball has left; {cause} moves magnets too fast"):
         simulation.step()
         assert simulation.state  # waits for a GPU
 

@@ -324,7 +324,7 @@ def test_instances_and_references_are_converted_once(tmp_path):
     assert all(-0.25 < entry[1] < -0.2 for entry in fallen)  # cm after 1/48 s
 
 
-def test_a_unit_that_is_not_set_is_told(tmp_path):
+def test_a_missing_unit_causes_a_warning(tmp_path):
     path = table(tmp_path / "scene.usda", ARTIST)
     path.write_text(path.read_text().replace("metersPerUnit = 0.01", ""))
     result = survey(open_stage(path)).findings

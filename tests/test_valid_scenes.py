@@ -6,7 +6,24 @@ import newton
 import numpy as np
 import pytest
 from pxr import Usd
-from small_stages import CHAIN, FIELD, IRON, LEFT, PERMANENT, RIGHT, A, B, C, G, R, ball, joint, physics, told, write
+from small_stages import (
+    CHAIN,
+    FIELD,
+    IRON,
+    LEFT,
+    PERMANENT,
+    RIGHT,
+    A,
+    B,
+    C,
+    G,
+    R,
+    ball,
+    errors_and_warnings,
+    joint,
+    physics,
+    write,
+)
 
 import warpmag
 from warpmag.engine.stepping.simulation import Simulation
@@ -52,7 +69,7 @@ FALLING = {
 @pytest.mark.parametrize("case", FALLING)
 def test_what_nothing_holds_falls_freely(case, device, tmp_path, capsys):
     path = write(tmp_path, *FALLING[case])
-    told(path, tmp_path, device, capsys, frames=6)
+    errors_and_warnings(path, tmp_path, device, capsys, frames=6)
     stage = Usd.Stage.Open(str(tmp_path / "out.usda"))
     places = [prim.GetAttribute("xformOp:translate:warpmag") for prim in stage.Traverse()]
     ways = np.array([np.subtract(place.Get(0.0), place.Get(6.0)) for place in places if place])
@@ -147,7 +164,7 @@ STILL = {
 @pytest.mark.parametrize("case", STILL)
 def test_what_nothing_moves_stays(case, device, tmp_path, capsys):
     path = write(tmp_path, *STILL[case])
-    assert told(path, tmp_path, device, capsys) == ([], [])
+    assert errors_and_warnings(path, tmp_path, device, capsys) == ([], [])
     before, after = Usd.Stage.Open(str(path)), Usd.Stage.Open(str(tmp_path / "out.usda"))
     for name in ("A", "B"):
         if prim := before.GetPrimAtPath(f"/World/{name}"):
@@ -304,7 +321,7 @@ def test_two_letters_at_one_place_come_apart_and_a_line_says_why(device, tmp_pat
     assert np.abs(velocities).max() < 2.0 * RECOVERY_SPEED  # of points; centers may be faster
 
 
-def test_what_leaves_all_finite_numbers_is_told_with_what_was_wrong_before(device, tmp_path):
+def test_a_state_that_is_not_finite_is_reported_with_its_cause(device, tmp_path):
     simulation = Simulation(write(tmp_path, physics(0.0), letter("A"), letter("B")), device=device)
     simulation.state.body_qd.fill_(math.inf)
     with pytest.raises(SimulationError, match="is not finite any more; bodies overlapped at the start"):

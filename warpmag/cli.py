@@ -97,8 +97,8 @@ def _execute(arguments: list[str] | None, all_ranks: Ranks | None, stopwatch: St
         return FAILED, f"{type(error).__name__}: {error}"
 
 
-def _no_memory(told: str) -> str:
-    return one_line(f"not enough memory ({told})" if told else "not enough memory")
+def _no_memory(reason: str) -> str:
+    return one_line(f"not enough memory ({reason})" if reason else "not enough memory")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -107,10 +107,12 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _scenes(options) -> int:
-    from warpmag.scenes_usd import MADE, bundled, summary  # noqa: PLC0415 - each command imports what it needs
+    from warpmag.scenes_usd import GENERATED_SCENES, bundled, summary  # noqa: PLC0415 - each command imports what it needs
     from warpmag.usd import describe  # noqa: PLC0415
 
-    lines = {name: describe(path) for name, path in bundled().items()} | {name: summary(name) for name in MADE}
+    lines = {name: describe(path) for name, path in bundled().items()} | {
+        name: summary(name) for name in GENERATED_SCENES
+    }
     width = max(map(len, lines))
     for name, line in sorted(lines.items()):
         print(f"{name:{width}}  {line}")
@@ -133,12 +135,12 @@ def _materials(_) -> int:
 
 def _find_scene(name: str, balls: int | None = None, folder: Path = _OUTPUT_FOLDER) -> tuple[Path, bool]:
     """Return the file of a scene, and whether it is bundled. A generated scene is written to ``folder``."""
-    from warpmag.scenes_usd import MADE, bundled, make  # noqa: PLC0415
+    from warpmag.scenes_usd import GENERATED_SCENES, bundled, make  # noqa: PLC0415
     from warpmag.usd import usable_path  # noqa: PLC0415
 
     scenes = bundled()
     path = usable_path(name)
-    if name in (*scenes, *MADE) and not os.path.isfile(path):
+    if name in (*scenes, *GENERATED_SCENES) and not os.path.isfile(path):
         if balls is None and name in scenes:
             return scenes[name], True
         generated = on_first_rank(lambda: make(name, folder, balls), current_ranks())
@@ -146,7 +148,9 @@ def _find_scene(name: str, balls: int | None = None, folder: Path = _OUTPUT_FOLD
             log(f"scene: {generated}")
         return generated, False
     if not os.path.exists(path) and not path.suffix:
-        raise InputError(f"{name}: no such file and no bundled scene (bundled: {', '.join((*scenes, *MADE))})")
+        raise InputError(
+            f"{name}: no such file and no bundled scene (bundled: {', '.join((*scenes, *GENERATED_SCENES))})"
+        )
     if balls is not None:
         raise InputError(f"balls: {name} is a file; --balls is for bundled scenes")
     return path, False

@@ -108,12 +108,12 @@ def make_parser(commands: Mapping[str, Callable[[Any], int]]) -> argparse.Argume
 
     _add_run(add("run", "simulate a scene and write it as a USD stage", _RUN_EXAMPLES))
     add("scenes", "list the bundled scenes", "\n  warpmag scenes\n")
-    text = "list the materials that magnets can have by name"
+    text = "list the named materials of magnets"
     add("materials", text, "\n  warpmag materials\n")
     check = add("check", "report the contents and the errors of a stage", "\n  warpmag check lift.usda\n")
     check.add_argument("stage", metavar="STAGE", help=_STAGE)
     _add_render(add("render", "draw frames of a stage or of a finished run", _RENDER_EXAMPLES))
-    text = "export a scene or a finished run: a stage for renderers, a web page, or numbers"
+    text = "export a scene or a finished run as a stage for renderers, a web page, or a table of numbers"
     _add_export(add("export", text, _EXPORT_EXAMPLES))
     return parser
 
@@ -139,16 +139,16 @@ def _add_run(run: argparse.ArgumentParser) -> None:
     add("--external-field", type=float, nargs=3, metavar=("HX", "HY", "HZ"), help=text)
     add("--device", help=_DEVICE)
     add("--solver", choices=SOLVERS, default=next(iter(SOLVERS)), help="rigid-body solver (default: %(default)s)")
-    text = "force law, dynamics, and curve of all magnets: from this library, Kim and Han 2022, or Kim et al. 2018"
+    text = "force law, dynamics and curve of all magnets, as in this library, Kim and Han 2022, or Kim et al. 2018"
     add("--preset", choices=PRESETS, help=text)
-    add("--force", choices=FORCES, help="force law (default: the stage's)")
-    add("--dynamics", choices=DYNAMICS, help="magnetization dynamics (default: the stage's)")
+    add("--force", choices=FORCES, help="force law (default: the stage's, else kelvin)")
+    add("--dynamics", choices=DYNAMICS, help="magnetization dynamics (default: the stage's, else theta)")
     add("--contact-model", choices=CONTACT_MODELS, help=_CONTACT_MODEL)
     names = f"{{{','.join(METHODS)}}}"
-    text = "summation by the faster method, over all pairs, or by multipoles (default: %(default)s)"
+    text = "sums over all pairs (direct), by multipoles (fmm), or the faster of both (default: %(default)s)"
     add("--method", action=_Method, default=METHODS[0], metavar=names, help=text)
     add("--sums", dest="method", action=_Renamed, choices=METHODS, default=METHODS[0], help=argparse.SUPPRESS)
-    text = "relative magnetization error at which induction ends, at least 2e-6 (default: the stage's)"
+    text = "relative magnetization error at which induction ends, at least 2e-6 (default: the stage's, else 1e-3)"
     add("--rtol", type=float, metavar="X", help=text)
     text = "viewer that shows the run (default: %(default)s)"
     add("--viewer", choices=("none", *VIEWERS), default="none", help=text)
@@ -160,13 +160,19 @@ def _add_run(run: argparse.ArgumentParser) -> None:
 def _add_render(render: argparse.ArgumentParser) -> None:
     add = render.add_argument
     add("stage", metavar="STAGE", help=_STAGE)
-    add("-o", "--output", metavar="FILE", required=True, help="picture (.png) or film (.mp4, .webp, .gif)")
+    add(
+        "-o",
+        "--output",
+        metavar="FILE",
+        required=True,
+        help="picture (.png, .jpg with --quality final) or film (.mp4, .webp, .gif)",
+    )
     frames = render.add_mutually_exclusive_group()
     text = "number of the frame to draw, 0 for the start (default: the last)"
     frames.add_argument("--frame", type=int, metavar="N", help=text)
     frames.add_argument("--frames", metavar="A:B", help="first and last frame to draw (default for a film: all)")
     add("--size", metavar="WxH", default="960x540", help="width and height [px] (default: %(default)s)")
-    text = "draft, or final by Blender's path tracer (default: %(default)s)"
+    text = "draft by ray tracing, or final by Blender's path tracer (default: %(default)s)"
     add("--quality", choices=("draft", "final"), default="draft", help=text)
     add("--arrows", action="store_true", help="draw the moments of a finished run as arrows")
     add("--moments", dest="arrows", action=_Renamed, nargs=0, const=True, help=argparse.SUPPRESS)

@@ -22,11 +22,11 @@ def extra(name: str) -> str:
 
 
 _OWN_MODULES = re.compile(r"(warpmag|warp|contextlib)\b(?!\.examples)")
-"""Modules whose lines are no user's: warpmag, and those that call it on its behalf."""
+"""Modules that are not part of the user's program: warpmag, and modules that it is called through."""
 
 
 def warn_caller(text: str, category: type[Warning] = UserWarning) -> None:
-    """Warn with the line of the user's program that called warpmag, however deep the cause is."""
+    """Issue a warning at the line of the user's program that called warpmag, at any depth of calls."""
     frame: FrameType | None = sys._getframe(1)
     level = 2
     while frame is not None and _OWN_MODULES.match(frame.f_globals.get("__name__", "")):

@@ -26,7 +26,7 @@ enum CellPairPass {
     ASSIGN,
     LINK,
     TABULATE,
-    TAKE_BALLS,
+    COPY_BALLS,
     ADD_FIELD,
     ADD_FORCE,
     ADD_REACTION
@@ -337,8 +337,8 @@ template <class Pairs> CUDA_CALLABLE inline void add_reaction(const Pairs& a, in
     add_wrenches(rows, box, force, torque);
 }
 
-// Writes the moment of moment i if it is a ball.
-template <class Pairs> CUDA_CALLABLE inline void take_ball(const Pairs& a, int i) {
+// Copies the moment of moment i from the packed moments if it is a ball.
+template <class Pairs> CUDA_CALLABLE inline void copy_ball(const Pairs& a, int i) {
     if (i >= a.group.shape[0] || a.body.data[i] < a.grid.shape[0]) return;
     const Real* const m = (const Real*)a.packed.data + 4 * (a.packed.strides[0] / sizeof(Real)) + i;
     for (int k = 0; k < 3; ++k) ((Real*)a.means.data)[3 * (size_t)i + k] = m[k * (a.packed.strides[0] / sizeof(Real))];
@@ -356,7 +356,7 @@ template <class Pairs> CUDA_CALLABLE inline void arrange_rows(const Pairs& a, in
 }
 
 template <class Pairs> CUDA_CALLABLE inline void make_cell_pair_pass(const Pairs& a, int pass, int i) {
-    if (pass >= TABULATE && pass != TAKE_BALLS) {
+    if (pass >= TABULATE && pass != COPY_BALLS) {
         const bool rests = pass == TABULATE && a.searching.data[0] == 0 && a.displaced.data[0] == 0;
         if (i >= a.cell.shape[0] || rests) return;
         if (pass == TABULATE) tabulate(a, i);
@@ -366,10 +366,10 @@ template <class Pairs> CUDA_CALLABLE inline void make_cell_pair_pass(const Pairs
         return;
     }
     for (int l = 0; l < WIDTH; ++l)
-        if (pass != LOCATE && pass != TAKE_BALLS) arrange_rows(a, pass, i + l);
+        if (pass != LOCATE && pass != COPY_BALLS) arrange_rows(a, pass, i + l);
         else if (share() != 0) return;
         else if (pass == LOCATE) locate(a, i + l);
-        else take_ball(a, i + l);
+        else copy_ball(a, i + l);
 }
 
 template <class Word, class Pairs>

@@ -72,7 +72,7 @@ _SAMPLES = 32
 """Points whose neighbors are counted for the length of the lists."""
 _MARGIN = 0.5
 """Fraction of half its size that a cell may move before candidates are searched again."""
-LOCATE, CLEAR, SELECT, ARRANGE, ASSIGN, LINK, TABULATE, TAKE_BALLS, ADD_FIELD, ADD_FORCE, ADD_REACTION = range(11)
+LOCATE, CLEAR, SELECT, ARRANGE, ASSIGN, LINK, TABULATE, COPY_BALLS, ADD_FIELD, ADD_FORCE, ADD_REACTION = range(11)
 """The passes, in order; as in ``cell_pairs.h``."""
 _MATRIX_ROWS, _DETAIL_ROWS, _POSE_ROWS, _REACTION_ROWS = 9, 27, 7, 8
 """Numbers stored for a pair: matrix of means, matrices of differences, relative pose, and force and torque; as in
@@ -181,10 +181,10 @@ def _balls_among_cells(balls, radii, worlds, group, half) -> np.ndarray:
     """Return the balls that are at least as wide as the longest cell of their world, and write their half sides."""
     longest = np.zeros(worlds.max() + 1)
     np.maximum.at(longest, worlds[group >= 0], half[:3, group >= 0].max(axis=0))
-    taken = np.flatnonzero(balls & (longest[worlds] > 0.0) & (radii >= longest[worlds]))
-    half[:3, taken] = _BALL_REACH * longest[worlds[taken]]
-    half[3, taken] = 2.0 * half[0, taken]
-    return taken
+    near_balls = np.flatnonzero(balls & (longest[worlds] > 0.0) & (radii >= longest[worlds]))
+    half[:3, near_balls] = _BALL_REACH * longest[worlds[near_balls]]
+    half[3, near_balls] = 2.0 * half[0, near_balls]
+    return near_balls
 
 
 def _list_length(bodies, group, balls, reach: float) -> int:
@@ -260,10 +260,10 @@ class CellPairs:
             most, least = sides.max(axis=0), sides.min(axis=0)
             half[3, span] = 2.0 * most * np.sqrt(np.minimum(most / least, _FLATTEST)) * _volume_factors(sides)
             half[3, span] *= _OF_SHEETS if coupling.is_sheet else 1.0
-        taken = _balls_among_cells(layout.single_balls, layout.radii, worlds, group, half)
-        group[taken], body[taken] = worlds[taken], len(bodies)
+        near_balls = _balls_among_cells(layout.single_balls, layout.radii, worlds, group, half)
+        group[near_balls], body[near_balls] = worlds[near_balls], len(bodies)
         ratio, reach = WINDOW[1] + _MARGIN, float(half[3, group >= 0].max())
-        capacity = _list_length([body for body in bodies if group[body[0]] >= 0], group, taken, ratio * reach)
+        capacity = _list_length([body for body in bodies if group[body[0]] >= 0], group, near_balls, ratio * reach)
         padded = -(-int((group >= 0).sum()) // CHUNK) * CHUNK
 
         def put(values, kind=wp.int32):
@@ -298,10 +298,9 @@ class CellPairs:
         a.detail = _large_zeros(padded * a.close_capacity * _DETAIL_ROWS, dtype, device)
         a.reaction = _large_zeros(padded * capacity * _REACTION_ROWS, dtype, device)
         self._locate, self._tabulate = self._record(LOCATE, LOCATE), self._record(CLEAR, TABULATE)
-        self._field, self._force = (
-            self._record(TAKE_BALLS if len(taken) else ADD_FIELD, ADD_FIELD),
-            [*(self._record(TAKE_BALLS, TAKE_BALLS) if len(taken) else []), *self._record(ADD_FORCE, ADD_REACTION)],
-        )
+        copy_balls = self._record(COPY_BALLS, COPY_BALLS) if len(near_balls) else []
+        self._field = self._record(COPY_BALLS if copy_balls else ADD_FIELD, ADD_FIELD)
+        self._force = [*copy_balls, *self._record(ADD_FORCE, ADD_REACTION)]
 
     def for_all_moments(self, cells, packed, h) -> "CellPairs":
         """Return pairs of the same model with lists and tensors of their own, for other moments.

@@ -42,7 +42,7 @@ _LEAST_MUTUAL = 0.75  # least fraction of the sources that are targets, for whic
 _MOST_SHORT = 48, 256
 """Most targets and most sources of a segment with the form ``SHORT``. A tile of the loop has 96 to 256 targets, most of
 which would be copies."""
-_LEAST_SHARED = {"cpu": 800_000, "cuda": 1_000_000_000}
+_FEWEST_PAIRS_OF_RANKS = {"cpu": 800_000, "cuda": 1_000_000_000}
 """Fewest pairs for which several processes share the sums, by kind of device."""
 _CONSTANTS = {"CAPACITY": CAPACITY, "MU0": MU0, "INVERSE_4PI": INVERSE_4PI}
 
@@ -94,7 +94,8 @@ class PairEvaluation:
         self._arrays = a = work_list.arrays_type(dtype)()
         a.target, a.begin, a.end = work_list.target_rows(segments, device, copies)
         self.target, self.count, self.pair_count = a.target, a.target.shape[0], work_list.pair_count(segments)
-        shared = self.form in (LOOP, MIRRORED) and self.pair_count >= _LEAST_SHARED["cuda" if device.is_cuda else "cpu"]
+        fewest_pairs = _FEWEST_PAIRS_OF_RANKS["cuda" if device.is_cuda else "cpu"]
+        shared = self.form in (LOOP, MIRRORED) and self.pair_count >= fewest_pairs
         self._ranks = ranks if shared else None
         self._finished = Quantity.FORCE if quantity == Quantity.MUTUAL_FORCE else quantity
         parts, tiles = self._plan_sums(quantity, segments, targets, targets is sources, smoothing)

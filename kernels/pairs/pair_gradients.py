@@ -31,9 +31,12 @@ from warpmag.kernels.shared.native import PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes
 
-_LEAST_SHARED, _MOST_SHARED = 256, 8192
-"""Fewest sources per moment for which a warp shares a moment, in systems of at most so many moments: so few moments
-occupy all processors, while more moments load the sources less often with smaller groups."""
+_FEWEST_WARP_SOURCES, _MOST_WARP_MOMENTS = 256, 8192
+"""Fewest sources per moment, and most moments, for which a whole warp sums one moment.
+
+A warp per moment occupies all processors if there are few moments. With more moments smaller groups occupy them, too,
+and load the sources less often.
+"""
 
 _FEWEST_EVALUATED, _MOST_IN_ONE_SUM = 512, 4096
 """Fewest sources per moment for which a GPU computes gradients of fields faster as a field and two forces, in systems
@@ -149,7 +152,7 @@ class PairGradients:
             a.external_field, a.by_external_field = external_field, out[2]
         self.by_external_field = out[-1]
         segments = np.stack([ends[:-1], ends[1:]] * 2, axis=1)
-        is_shared = device.is_cuda and n <= _MOST_SHARED and pair_count(segments) >= _LEAST_SHARED * n
+        is_shared = device.is_cuda and n <= _MOST_WARP_MOMENTS and pair_count(segments) >= _FEWEST_WARP_SOURCES * n
         self._group = group_threads(device, long_lists=is_shared)
         _, a.begin, a.end = target_rows(segments, device)
         self._mirror, parts = None, 0

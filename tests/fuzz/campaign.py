@@ -185,7 +185,7 @@ def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Ca
     output = place / "out" / "out.usda"
     _reached.begin()
     with _recorded() if command is in_process else contextlib.nullcontext([]) as simulations:
-        verdict.check, told, stderr_of_check = command("check", str(path))
+        verdict.check, report, stderr_of_check = command("check", str(path))
         verdict.run, _, stderr_of_run = command(
             "run", str(path), "--frames", "1", "--device", device, "-o", str(output)
         )
@@ -194,7 +194,7 @@ def judge(number: int, seed: int, folder: Path, sources: list[Path], command: Ca
         verdict.problems += talk("render", stderr_of_render)
         if shown != OK and len(messages(stderr_of_render)) != 1:
             verdict.problems.append(f"render ends with {shown}: {messages(stderr_of_render)}"[:300])
-    errors = [line[12:] for line in told if line.startswith("error ")] + messages(stderr_of_check)
+    errors = [line[12:] for line in report if line.startswith("error ")] + messages(stderr_of_check)
     refusals = messages(stderr_of_run)
     verdict.line = refusals[-1] if refusals else ""
     verdict.problems += [*talk("check", stderr_of_check), *talk("run", stderr_of_run)]

@@ -130,8 +130,8 @@ class SourceRecord:
 class Coil:
     """A coil in its own frame; each field is a row of the table of attributes.
 
-    Loops and solenoids are about the z axis. A positive current makes a field along z inside them. A coil with a
-    resistance has a voltage, and its current follows. The current of other coils is given.
+    The axis of loops and solenoids is z. A positive current causes a field along +z inside them. The current of a coil
+    with a resistance follows from its voltage. The current of other coils is given.
     """
 
     shape: Annotated[str, Attribute(
@@ -165,8 +165,8 @@ class Coil:
     )] = 0.0  # fmt: skip
     ampere_turns: Annotated[float, Attribute(
         "coil:ampereTurns", "float", "Ampere-Turns",
-        "Current times turns; a positive current makes a field along z inside a loop or a solenoid. With a resistance "
-        "it is the current at the start.",
+        "Current times turns; a positive current causes a field along +z inside a loop or a solenoid. With a "
+        "resistance it is the value at the start.",
         unit="ampere", range=f"[-{LARGEST_STRENGTH:g}, {LARGEST_STRENGTH:g}]", check=check_strength,
     )] = 0.0  # fmt: skip
     resistance: Annotated[float, Attribute(
@@ -184,7 +184,7 @@ class Coil:
     )] = 0.0  # fmt: skip
     inductance: Annotated[float, Attribute(
         "coil:inductance", "float", "Inductance",
-        "Inductance in air of a coil with a resistance, as measured; 0 means that of its geometry.",
+        "Measured inductance in air of a coil with a resistance; 0 means the computed value of its geometry.",
         unit="henry", range=_CIRCUIT_TEXT, check=check_circuit_value, uniform=True,
     )] = 0.0  # fmt: skip
 

@@ -1,6 +1,6 @@
-"""Derivatives of measured magnetization curves by their points.
+"""Derivatives of measured magnetization curves with respect to their points.
 
-Between two points M is Hermite's cubic of their magnetizations and slopes, beyond the last point M = Ms − D²/z with
+Between two points M is Hermite's cubic of their magnetizations and slopes. Beyond the last point M = Ms − D²/z with
 D = Ms − M_n and z = D + M'_n (H − H_n) (``curves.py``). Slopes and Ms follow from the points, so each chain of
 derivatives ends there.
 """
@@ -12,10 +12,10 @@ from warpmag.errors import InputError
 
 
 def point_gradients(curve: MagnetizationCurve, ball_fields, weights) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gradients of Σ w M of balls by the fields and by the magnetizations of a curve's points.
+    """Return the gradients of Σ w M of balls with respect to fields and magnetizations of the points of a curve.
 
-    A change δM of the curve changes the magnetization of a ball in a fixed field of all others by δM/(1 + M'/3),
-    because its own field −M/3 changes, too.
+    A change δM of the curve changes the magnetization of a ball by δM/(1 + M'/3) at a fixed field of all others. The
+    reason is the ball's own field −M/3, which changes, too.
 
     Args:
         curve: Curve with extrapolated saturation.
@@ -23,7 +23,7 @@ def point_gradients(curve: MagnetizationCurve, ball_fields, weights) -> tuple[np
         weights: Factor w of each ball's magnetization, NumPy, shape [n].
 
     Returns:
-        Gradients by ``curve.fields`` and by ``curve.magnetizations``, NumPy, shape [points] each.
+        Gradients with respect to ``curve.fields`` and to ``curve.magnetizations``, NumPy, shape [points] each.
 
     Raises:
         InputError: Two points have the same magnetization. The slope has no derivative there.
@@ -44,7 +44,7 @@ def point_gradients(curve: MagnetizationCurve, ball_fields, weights) -> tuple[np
 
 
 def _add_inside(h, m, d, ball_fields, weights, sums) -> None:
-    """Add the gradients of balls between points to those by fields, magnetizations and slopes of the points."""
+    """Add the gradients of balls between points to ``sums``: with respect to fields, magnetizations and slopes."""
     k = np.clip(np.searchsorted(h + m / 3.0, ball_fields, "right") - 1, 0, len(h) - 2)
     span, t = np.diff(h)[k], np.zeros(len(k))
     for step in 0.5 ** np.arange(1, 54):  # bisection of H' + M/3 = H to rounding
@@ -55,7 +55,7 @@ def _add_inside(h, m, d, ball_fields, weights, sums) -> None:
     of_slopes = t * (1.0 - t) ** 2, t * t * (t - 1.0)
     slope = 6.0 * t * (1.0 - t) * (m[k + 1] - m[k]) / span
     slope += d[k] * (1.0 - t) * (1.0 - 3.0 * t) + d[k + 1] * t * (3.0 * t - 2.0)
-    stretch = d[k] * of_slopes[0] + d[k + 1] * of_slopes[1]  # derivative by the span at constant t
+    stretch = d[k] * of_slopes[0] + d[k + 1] * of_slopes[1]  # derivative with respect to the span at constant t
     weights = weights / (1.0 + slope / 3.0)
     by_points = (
         (slope * (t - 1.0) - stretch, stretch - slope * t),
@@ -74,7 +74,7 @@ def _cubic(m, d, k, t, span):
 
 
 def _add_beyond(h, m, d, saturation, ball_fields, weights, sums) -> None:
-    """Add the gradients of balls beyond the last point, as :func:`_add_inside`."""
+    """Add the gradients of balls beyond the last point to ``sums``, as :func:`_add_inside` does."""
     by_h, by_m, by_d = sums
     left = saturation - m[-1]
     by_left = by_slope = slope = np.zeros(len(weights))
@@ -92,7 +92,7 @@ def _add_beyond(h, m, d, saturation, ball_fields, weights, sums) -> None:
 
 
 def _add_slopes(h, m, d, by_d, by_h, by_m) -> None:
-    """Add the gradients by slopes of PCHIP to those by fields and magnetizations of the points."""
+    """Add the gradients with respect to PCHIP's slopes to those with respect to fields and magnetizations."""
     span, secant = np.diff(h), np.diff(m) / np.diff(h)
     by_span, by_secant = np.zeros((2, len(span)))
     by_secant[0] += by_d[0]

@@ -5,13 +5,13 @@ from warpmag.errors import UnitWarning, warn_caller
 _STRENGTHS = 1e3, 2e6
 """Magnetization of permanent magnets [A/m]: flexible ferrite has 1e5, NdFeB 1.2e6."""
 _STRONGEST_REMANENCE = 3.0
-"""Number up to which a magnetization is likely a remanence [T]; that of NdFeB is 1.5."""
+"""Largest number that is more likely a remanence [T] than a magnetization [A/m]; NdFeB has up to 1.5 T."""
 _LARGEST_BALL = 0.5
-"""Radius [m] from which that of a magnetic ball is likely in another unit."""
+"""Smallest radius [m] of a magnetic ball that is likely in another unit."""
 
 
 def warn_of_magnetization(magnetization: float) -> None:
-    """Warn of a magnetization [A/m] that no permanent magnet has. Zero, a magnet that is off, is none of these."""
+    """Warn of a magnetization [A/m] that no permanent magnet has. Zero, a magnet that is off, causes no warning."""
     least, most = _STRENGTHS
     if magnetization == 0.0 or least <= magnetization <= most:
         return

@@ -38,7 +38,7 @@ METHODS = ("auto", "direct", "fmm")
 DYNAMICS = ("theta", "theta-euler", "llg", "llg-damping")
 
 ACCURACY = {"float32": 2e-6, "float64": 1e-13}
-"""Largest relative L2 error of sums over all pairs in tests, by precision. It is also the smallest valid tolerance."""
+"""Smallest valid relative tolerance by precision. It exceeds the L2 error of fields by sums over all pairs in tests."""
 
 MATERIAL_RANGE = {"float32": (1e-12, 1e15), "float64": (1e-100, 1e100)}
 """Smallest and largest saturation [A/m] and finite susceptibility, by the precision of a solve."""
@@ -48,7 +48,7 @@ MAGNET_SIZES = (1e-8, 2e4)
 """Smallest and largest radius or half side [m] of a magnetic shape: its moment and the moment's square stay in float32.
 """
 _RECOIL_RANGE = (1.001, 10.0)
-"""Smallest recoil permeability above 1 that float32 resolves, and a limit above all magnets: AlNiCo reaches 5."""
+"""Smallest recoil permeability above 1 that float32 resolves, and an upper limit: AlNiCo reaches 5."""
 
 SATURATION_OF_IRON = 1.7e6
 """Default saturation magnetization [A/m]."""
@@ -98,7 +98,7 @@ def check_force(name: str, value: Any, contact_model: str = "dipole") -> None:
 
 
 def check_rtol(name: str, value: Any, dtype: str = "float32") -> None:
-    """Raise :class:`InputError` unless ``value`` is a relative error that sums in ``dtype`` can reach."""
+    """Raise :class:`InputError` unless ``value`` is a finite relative error of at least :data:`ACCURACY`."""
     number = real_number(name, value)
     if not ACCURACY[dtype] <= number < math.inf:
         raise InputError(f"{name}: must be at least {ACCURACY[dtype]:g} in {dtype} and finite, got {number:g}")
@@ -207,7 +207,7 @@ class MagneticSettings:
     )] = "kelvin"  # fmt: skip
     dynamics: Annotated[str, Attribute(
         "dynamics", "token", "Magnetization Dynamics",
-        "Scheme that brings the moments to equilibrium: the exact flow, accelerated (theta), its explicit Euler "
+        "Iteration toward the equilibrium of the moments: the exact flow, accelerated (theta), its explicit Euler "
         "step (theta-euler), or LLG (Eq. 6) with and without precession (llg, llg-damping).",
         tokens=DYNAMICS, uniform=True,
     )] = "theta"  # fmt: skip
@@ -235,7 +235,7 @@ class MagneticSettings:
         check_fields(self, name, "dynamics", "rtol")
 
     def replaced(self, **values) -> "MagneticSettings":
-        """Return the settings, unchecked, with ``values`` in place of earlier ones; values of None change nothing."""
+        """Return the settings with new ``values``, unchecked; a value of None keeps the present one."""
         return replace(self, **{name: value for name, value in values.items() if value is not None})
 
 

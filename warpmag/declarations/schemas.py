@@ -8,14 +8,14 @@ MAGNET_SCHEMA = Schema(
     "WarpmagMagnetAPI",
     Magnet,
     "Makes a rigid body, or one collider, a magnet: inducible (iron) or permanent.\n\n"
-    "Applied to a rigid body it covers all the colliders of the body; applied to a collider, that collider alone.",
+    "On a rigid body the schema applies to all its colliders, on a collider to that collider alone.",
     usd_only=(
         Attribute(
             "material", "token", "Material",
             "Name of a material, such as iron, mild-steel, N42 or hard-ferrite. For an inducible magnet it replaces "
-            "saturation magnetization and susceptibility, or the curve. For a permanent magnet it gives the strength, "
-            "and warpmag:magnetization the direction. The body takes the density of the material if the stage has "
-            "neither mass nor density.",
+            "saturation magnetization and susceptibility, and the curve if the material has a measured one. For a "
+            "permanent magnet it sets the strength, and warpmag:magnetization the direction. The body has the density "
+            "of the material if the stage has neither mass nor density.",
             uniform=True, field="material", default="",
         ),
         Attribute(
@@ -40,7 +40,7 @@ COIL_SCHEMA = Schema(
     "WarpmagCoilAPI",
     Coil,
     "Makes a prim with a transform a coil. Its field acts on magnets. The coil moves with the nearest rigid body at or "
-    "above the prim, and the reaction acts on that body. Loops and solenoids are about the z axis of the prim.",
+    "above the prim, and the reaction acts on that body. The axis of loops and solenoids is the z axis of the prim.",
     usd_only=(
         Attribute(
             "coil:current", "double", "Current",
@@ -53,8 +53,8 @@ COIL_SCHEMA = Schema(
 FIELD_MAP_SCHEMA = Schema(
     "WarpmagFieldMapAPI",
     FieldMap,
-    "Makes a prim with a transform a field on a regular grid, interpolated by cubic convolution, and zero outside. The "
-    "map moves with the nearest rigid body at or above the prim, and the reaction acts on that body.",
+    "Makes a prim with a transform a field map: a field on a regular grid, interpolated by cubic convolution, and zero "
+    "outside. The map moves with the nearest rigid body at or above the prim, and the reaction acts on that body.",
     usd_only=(
         Attribute(
             "fieldMap:counts", "int3", "Counts", "Number of nodes along each axis.",

@@ -29,8 +29,8 @@ from warpmag.moments.ranks import compare_arguments
 from warpmag.moments.tape import check_constant, paused_tape, record
 
 _METHODS = ("auto", "direct", "reference", "fmm")
-_LEAST_OF_FIELD = {wp.float32: 1e-25, wp.float64: 1e-200}
-"""Lower limit [A·m²] of the largest moment component for fields, by Warp scalar type: smaller fields underflow."""
+_LEAST_FIELD_MOMENT = {wp.float32: 1e-25, wp.float64: 1e-200}
+"""Lower limit [A·m²] of the largest moment component, by Warp scalar type: fields of smaller moments underflow."""
 
 
 @compare_arguments
@@ -76,8 +76,8 @@ def h_field(
         H [A/m], shape [t, 3], as NumPy array, or as Warp array of vectors if ``positions`` is a Warp array.
 
     Raises:
-        InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (the
-            message has the limits), or the result is not finite. Or a tape is active, and an argument requires a
+        InputError: An argument has a wrong shape, contains no real numbers or is out of range of ``dtype``; the message
+            names the limits. Or the result is not finite. Or a tape is active, and an argument requires a
             gradient that does not exist.
 
     Example:
@@ -97,7 +97,7 @@ def h_field(
         target_size = _largest_radius("target_radii", target_radii, context.dtype, reference)
         farthest = largest_coordinate(context.dtype, size + (size if same_set else target_size), reference=reference)
         x = context.vectors("positions", positions, farthest=farthest, shared=True)
-        m = context.vectors("moments", moments, x.shape[0], least=_LEAST_OF_FIELD, shared=True)
+        m = context.vectors("moments", moments, x.shape[0], least=_LEAST_FIELD_MOMENT, shared=True)
         sources = _balls(context, "radii", radii, size, x, m)
         points = sources
         if not same_set:
@@ -118,7 +118,7 @@ def h_field(
             _check_finite("field", context, sums.out, sources, points)
             field = context.result(sums.out, points.count)
         if tape is not None:
-            check_constant({"radii": radii, "target_radii": target_radii}, "the field has none by radii")
+            check_constant({"radii": radii, "target_radii": target_radii}, "the field has none with respect to radii")
             arguments = {"positions": positions, "moments": moments, "targets": targets}
             _check_smoothing(smoothing, arguments)
             others = None if same_set else points
@@ -166,8 +166,8 @@ def wrench(
         Forces [N] and torques about each moment's position [N·m], each of shape [n, 3], NumPy or Warp as ``positions``.
 
     Raises:
-        InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (the
-            message has the limits), or a result is not finite. Or a tape is active, and an argument requires a
+        InputError: An argument has a wrong shape, contains no real numbers or is out of range of ``dtype``; the message
+            names the limits. Or a result is not finite. Or a tape is active, and an argument requires a
             gradient that does not exist.
 
     Example:
@@ -198,7 +198,7 @@ def wrench(
             _check_finite("torque", context, sums.torques, balls, balls, more=", external_field")
             forces, torques = context.result(sums.out, n), context.result(sums.torques, n)
         if tape is not None:
-            check_constant({"radii": radii}, "forces and torques have none by radii")
+            check_constant({"radii": radii}, "forces and torques have none with respect to radii")
             arguments = {"positions": positions, "moments": moments, "external_field": external_field}
             _check_smoothing(smoothing, arguments)
             record(
@@ -216,7 +216,7 @@ def _balls(context: CallContext, name, radii, size, positions, moments=None) -> 
 
 
 def _check_smoothing(smoothing: float, arguments: dict) -> None:
-    """Raise ``InputError`` if an argument of a smoothed call requires a gradient."""
+    """Raise ``InputError`` if an argument of a call with smoothing requires a gradient."""
     if smoothing > 0.0:
         check_constant(arguments, "smoothing has none: the smoothed force is no gradient; leave smoothing out")
 

@@ -25,7 +25,7 @@ from warpmag.moments.tape import Gradients
 
 
 def sum_field(moments: BallMoments, targets: BallMoments | None, fmm_rtol: float | None = None) -> wp.array:
-    """Return the field [A/m] of moments at targets, whose own moments are ignored, or at themselves (None)."""
+    """Return the field [A/m] of moments at targets without the moments of the targets; None means the moments."""
     with pair_sums(_shape(Quantity.FIELD, moments, targets)) as sums:
         moments.pack(sums.moments)
         if targets is not None:

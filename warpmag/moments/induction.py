@@ -36,16 +36,16 @@ from warpmag.moments.system import MomentSystem
 from warpmag.moments.tape import check_constant, differentiable, paused_tape, record
 
 _FIELD_RANGE = {wp.float32: (3e-19, 1e12), wp.float64: (1e-100, 1e100)}
-"""Smallest and largest field, in units of the saturation, by Warp scalar type: its square and root stay accurate."""
+"""Smallest and largest field in units of the saturation, by Warp scalar type: squares and roots stay accurate."""
 _PLAUSIBLE = {wp.float32: (1e-15, 1e15), wp.float64: (1e-100, 1e100)}
-"""Range of plausible values by Warp scalar type. If a result is not finite, the error names arguments outside it."""
+"""Range of plausible values by Warp scalar type. If a result is not finite, the error names arguments beyond it."""
 
 
 @dataclass(frozen=True)
 class InductionResult:
     """Magnetic equilibrium of n balls, returned by :func:`solve_induction`.
 
-    A result can be pickled and copied. A copy has NumPy arrays and no :meth:`wrench`.
+    A result can be pickled and copied. The copy has NumPy arrays, and its :meth:`wrench` raises an error.
 
     Attributes:
         magnetizations: M [A/m], shape [n, 3].
@@ -149,7 +149,7 @@ class InductionResult:
         """Raise ``InputError`` if radii of overlapping balls require gradients."""
         radii = {"radii": self._arguments["radii"]}
         if differentiable(radii) and self._system.overlaps:
-            check_constant(radii, "overlapping balls have none by radii; move them apart")
+            check_constant(radii, "overlapping balls have none with respect to radii; move them apart")
 
 
 @compare_arguments
@@ -212,8 +212,8 @@ def solve_induction(
         The equilibrium, an :class:`InductionResult`.
 
     Raises:
-        InputError: An argument has a wrong shape, holds no real numbers or is out of range of ``dtype`` (the
-            message has the limits), or the result is not finite. Or a tape is active, and an argument requires a
+        InputError: An argument has a wrong shape, contains no real numbers or is out of range of ``dtype``; the message
+            names the limits. Or the result is not finite. Or a tape is active, and an argument requires a
             gradient that does not exist.
 
     Warns:

@@ -16,7 +16,7 @@ from warpmag.kernels.shared.copies import put_copies, repeat_rows
 from warpmag.moments.arrays import check_bodies, host_positive, host_radii, host_scalars, shape_message
 
 _LARGE_BODY = 16
-"""Fewest moments of a body whose forces on itself are left out of sums. Small bodies are summed faster with others."""
+"""Fewest moments of a body for which sums omit its forces on itself. Sums over smaller bodies are faster with them."""
 
 
 @dataclass(frozen=True)

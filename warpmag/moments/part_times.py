@@ -10,7 +10,7 @@ import warp as wp
 from warpmag.moments.system import MomentSystem
 
 _REPEATS, _LAUNCHES = 7, 10
-"""Measurements of a part, whose median is the result, and launches in each measurement."""
+"""Number of measurements of a part, and of launches in each. The median of the measurements is the result."""
 
 
 def part_times(system: MomentSystem) -> dict[str, float]:

@@ -15,7 +15,7 @@ from warpmag.errors import InputError
 from warpmag.kernels.shared.axpy import launch_add_scaled
 
 Gradients = dict[str, wp.array]
-"""Gradients of a loss by the arguments of a call, by their names."""
+"""Gradients of a loss with respect to the arguments of a call, by the names of the arguments."""
 
 
 @contextmanager

@@ -156,7 +156,7 @@ class Display:
             state: The state.
 
         Returns:
-            False if the viewer was closed or its reset button pressed, else true.
+            False if the viewer was closed or its reset button pressed, else True.
         """
         self.show(time, state)
         while self.viewer.is_running() and not self.viewer.should_step() and not self.restarted:

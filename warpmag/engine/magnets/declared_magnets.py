@@ -58,7 +58,7 @@ def add_inducible(
             function of the external field plus the fields of all other sources; for other shapes, of the field inside.
             For all shapes ``tanh-applied`` is a function of the external field plus the fields of all other sources.
         moment_spacing: Distance between sampled moments [m]. 0 means one moment for a ball, and at most 729 moments for
-            other bodies, or 27 for each shape of a body of more than 27 shapes.
+            other bodies. A body of more than 27 shapes may have 27 moments for each shape.
         conductivity: Electrical conductivity [S/m]. Eddy currents brake a conductor that moves through the field. Only
             a ball of one moment that is the only magnet of its body can conduct; :class:`warpmag.Magnetics` raises an
             error for others. 0 means no eddy currents. ``material`` does not set it, since eddy currents cost a sum
@@ -129,8 +129,8 @@ def add_permanent(
             M_r: about 1.05 for NdFeB, 1.1 for ferrite. At 1, the default, no field changes M. Above 1 the induction
             solve includes the magnet.
         moment_spacing: Distance between sampled moments [m]. 0 means one moment for a ball, 2 to 8 for most boxes and
-            cylinders (up to 256 in models with coils, field maps, recoil permeability or gradients), and at most 729
-            for other shapes.
+            cylinders, and at most 729 for other shapes. Boxes and cylinders in models with coils, field maps, recoil
+            permeability or gradients have up to 256.
         conductivity: Electrical conductivity [S/m], see :func:`add_inducible`.
 
     Returns:

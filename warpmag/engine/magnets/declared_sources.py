@@ -62,9 +62,9 @@ def add_coil(
             1 % of the coil's radius, or of the diagonal of a polyline's bounding box.
         ampere_turns: Current times turns [A], all turns of a solenoid; :meth:`warpmag.Magnetics.set_current` changes
             it. For a coil with a resistance, the value at the start.
-        resistance: Resistance of the winding and its supply [Ω]. The current then follows from the voltage, from the
-            flux of iron and magnets, and from that of coils that do not move relative to this one. By default the
-            current is given.
+        resistance: Resistance of the winding and its supply [Ω]. The current then follows from the voltage and from the
+            flux of iron, of magnets, and of coils that do not move relative to this one. By default the current is
+            given.
         voltage: Voltage [V] at a coil with a resistance; :meth:`warpmag.Magnetics.set_voltage` changes it. 0 is a
             short circuit.
         turns: Number of turns; a coil with a resistance needs it.

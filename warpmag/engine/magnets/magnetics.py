@@ -109,7 +109,7 @@ class Magnetics:
         """Sample the magnets of ``model`` and allocate all buffers.
 
         Args:
-            model: A finalized model with shapes marked by :func:`warpmag.add_inducible`,
+            model: A finalized model with shapes marked by :func:`warpmag.add_inducible` or
                 :func:`warpmag.add_permanent`.
             force: Force law, ``kelvin`` (Eqs. 13, 14) or ``zeeman`` (Eq. 4).
             dynamics: ``theta`` (exact flow, accelerated), ``theta-euler`` (the paper's explicit step), ``llg`` or
@@ -192,7 +192,7 @@ class Magnetics:
 
     @property
     def error(self) -> wp.array:
-        """Relative magnetization error of the last solve, on the device, shape [worlds with magnets].
+        """Estimated relative magnetization error of the last solve, on the device, shape [worlds with magnets].
 
         In worlds with bodies of cells, such as plates and bars, it is the error in the energy norm: closed loops of
         magnetization inside iron, which have no field, hardly count.
@@ -249,7 +249,7 @@ class Magnetics:
         check_state(state, self._model, *names, *(("body_qd",) if self.needs_velocities else ()))
 
     def reset(self, worlds: Any = None) -> None:
-        """Return worlds to the initial state; capturable in a graph with an array on the device.
+        """Reset worlds to the initial state; capturable in a graph with an array on the device.
 
         Their next induction starts from zero magnetization. Their coil currents and voltages, factors of field maps,
         magnetizations and external fields return to the values from which this object was made; set others afterwards.
@@ -376,7 +376,7 @@ class Magnetics:
         self.magnets = change_materials(self._values, (self._placed, *levels), self.magnets)
 
     def persistent_arrays(self) -> dict[str, PersistentArray]:
-        """Return the arrays that the next step depends on, by name: values set by the user and the last solution."""
+        """Return the arrays that determine the next step, by name: values set by the user and the last solution."""
         attributes = getattr(self._model, NAMESPACE)
         values = {"magnetization": attributes.magnetization, "strength": attributes.strength}
         values["field"] = self.external_field
@@ -549,7 +549,7 @@ class Magnetics:
             raise InputError("Magnetics: there is no field yet, call apply(state) or induce(state) first")
 
     def _refresh(self) -> None:
-        """Check that there was a solve, and write the moments of worlds that rest; probes call it, too."""
+        """Check that there was a solve, and write the moments of worlds that it solved with fewer moments."""
         self._check_induced()
         if self._refresh_resting is not None:
             self._refresh_resting()

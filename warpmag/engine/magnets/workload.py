@@ -14,7 +14,7 @@ _MOST_LINES = 10
 
 @dataclass(frozen=True)
 class BodyLoad:
-    """One magnet: all its shapes on one body."""
+    """Moments of one magnet and its estimated time. A magnet consists of all magnetic shapes of one body."""
 
     label: str  # of its first shape
     world: int  # Newton world, -1 for none
@@ -26,7 +26,7 @@ class BodyLoad:
 
 @dataclass(frozen=True)
 class Workload:
-    """Time of a step by part, and by body; ``str`` returns both as a table."""
+    """Time of each part of a step, and estimated time of each body; ``str`` returns both as a table."""
 
     seconds: dict[str, float]  # time of each part [s]
     bodies: tuple[BodyLoad, ...]  # the most expensive first

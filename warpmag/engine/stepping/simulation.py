@@ -296,7 +296,7 @@ class Simulation:
             self._read_reports()
 
     def reset(self, worlds: Any = None) -> None:
-        """Return worlds to the start: poses, velocities, induction, currents, fields; capturable in a graph.
+        """Reset worlds to the start: poses, velocities, induction, currents, fields; capturable in a graph.
 
         :attr:`time` and time-sampled values continue, and :attr:`control` is kept. :meth:`Magnetics.reset` describes
         the reset of magnets. Worlds share the length of substeps, which depends on the fastest motion in any world::
@@ -396,7 +396,7 @@ class Simulation:
         return self.finish()
 
     def frames_of(self, frames: int | None) -> int:
-        """Return ``frames`` after a check, or the number of frames of the scene if it is None; one second by default.
+        """Return ``frames`` after a check. None means the time range of the scene, or one second without a time range.
 
         Raises:
             InputError: ``frames`` is not a whole number from 1 to 2³¹ − 1.
@@ -423,11 +423,11 @@ class Simulation:
         return Recorder(scene, self._magnetics, self._stepper, self._statistics, output, **options)
 
     def _steps_at(self, frame: int) -> int:
-        """Return the number of steps before a frame."""
+        """Return the number of steps from the start to a frame."""
         return round(frame / (self.frame_rate * self.step_size))
 
     def finish(self) -> Statistics:
-        """Return the statistics, with the values of the final state; waits for the device."""
+        """Return the statistics, completed with values of the present state; waits for the device."""
         statistics = self.statistics
         if self._magnetics.is_solved:
             statistics.field_error = self._magnetics.field_error()

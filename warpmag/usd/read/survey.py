@@ -50,7 +50,7 @@ def read_magnets(stage: Usd.Stage) -> StageMagnets:
     """Read and check the magnets and the magnetic settings of a stage.
 
     Raises:
-        InputError: The first error of :func:`survey`, naming the prim, or ``stage`` is not a stage.
+        InputError: The stage has an error; the message names the prim of the first one. Or ``stage`` is not a stage.
     """
     check_stage(stage)
     contents = survey(stage)

@@ -1,8 +1,8 @@
-"""What cannot run, and what a user should know of a stage, is told alike by ``check`` and ``run``."""
+"""The commands ``check`` and ``run`` report the same errors and warnings of a stage."""
 
 import pytest
 from pxr import Usd, UsdGeom, UsdPhysics
-from small_stages import FIELD, LEFT, RIGHT, A, B, R, ball, joint, physics, told, write
+from small_stages import FIELD, LEFT, RIGHT, A, B, R, ball, errors_and_warnings, joint, physics, write
 
 from warpmag import Simulation
 from warpmag.declarations.magnets import Magnet, MagneticSettings
@@ -79,10 +79,10 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_run_is_told_by_both(case, device, tmp_path, capsys):
+def test_both_commands_report_the_same_error(case, device, tmp_path, capsys):
     parts, message = REFUSED[case]
     path = write(tmp_path, *parts)
-    [error], _ = told(path, tmp_path, device, capsys)
+    [error], _ = errors_and_warnings(path, tmp_path, device, capsys)
     assert message in error
     assert error in map(str, check(path).errors)  # without Newton
 
@@ -100,7 +100,7 @@ WARNED = {
 @pytest.mark.parametrize("case", WARNED)
 def test_warnings_of_both_are_the_same(case, device, tmp_path, capsys):
     parts, message = WARNED[case]
-    errors, warnings = told(write(tmp_path, *parts), tmp_path, device, capsys)
+    errors, warnings = errors_and_warnings(write(tmp_path, *parts), tmp_path, device, capsys)
     assert errors == []
     assert any(message in warning for warning in warnings)
 
@@ -156,7 +156,7 @@ def test_what_usd_passes_over_in_an_instance_is_refused(case, metres, tmp_path):
 def test_so_is_what_an_instance_in_an_instance_says(tmp_path, device, capsys):
     inner = f'def Xform "Inner" {{\n{COPY.format(IN_INSTANCE["a value"][0])}}}\n'
     path = write(tmp_path, physics(), KINDS, inner.replace("def Xform", "over", 1), NESTED)
-    (error,), _ = told(path, tmp_path, device, capsys)
+    (error,), _ = errors_and_warnings(path, tmp_path, device, capsys)
     assert error.startswith("/World/Outer/Copy: USD ignores the override /World/Inner/Copy/Ball in the instance")
 
 
@@ -185,13 +185,13 @@ def test_an_instance_that_says_nothing_runs(tmp_path, device, capsys):
     )
     variant = variant.replace("true", 'true\n variantSets = "size"\n variants = {\n string size = "large"\n}')
     path = write(tmp_path, physics(), KINDS, seen, copy_of_seen, variant, moved)
-    errors, _ = told(path, tmp_path, device, capsys, frames=1)
+    errors, _ = errors_and_warnings(path, tmp_path, device, capsys, frames=1)
     assert errors == []
     stage, copies = Usd.Stage.Open(str(tmp_path / "out.usda")), ["/World/Copy/Ball", "/World/Moved/Ball"]
     assert [stage.GetPrimAtPath(copy).GetAttribute("radius").Get() for copy in copies] == [0.02, R]
 
 
-def test_what_newton_complains_of_is_told_in_the_same_words():
+def test_errors_of_newton_are_reported_in_the_same_words():
     """USD names a stage with its session layer, which has an address."""
     with pytest.raises(InputError) as caught, newton_errors("scene.usda", "import"):
         raise ValueError("Cycle: @a.usda@,@anon:0x56157832e270:a-session.usda@</A/B> CANNOT reference: @a.usda@</A>")
@@ -208,7 +208,7 @@ def test_slips_are_warnings_of_both(device, tmp_path, capsys):
     ]
     parts[-1] = parts[-1].replace('"PhysicsMassAPI"', '"PhysicsMassAPI", "warpSceneAPI", "WarpMagMagnetAPI"')
     parts.append(OPEN.format(approximation="convexHull"))
-    errors, warnings = told(write(tmp_path, physics(), *parts), tmp_path, device, capsys)
+    errors, warnings = errors_and_warnings(write(tmp_path, physics(), *parts), tmp_path, device, capsys)
     assert errors == []
     expected = {f"{path}: {message}" for path, (_, *messages) in SLIPS.items() for message in messages}
     assert expected <= set(warnings)
@@ -238,13 +238,13 @@ def test_a_body_that_is_marked_as_a_collider_itself(device, tmp_path, capsys):
     inner = ball("Shape", (0, 0, 0), body=False, magnet=False)
     schemas = '"PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "WarpmagMagnetAPI"'
     body = f'def Xform "A" (prepend apiSchemas = [{schemas}]) {{\nfloat warpmag:momentSpacing = 0.01\n{inner}}}\n'
-    assert told(write(tmp_path, physics(field=FIELD), body), tmp_path, device, capsys)[0] == []
+    assert errors_and_warnings(write(tmp_path, physics(field=FIELD), body), tmp_path, device, capsys)[0] == []
 
 
 def test_a_broken_rule_of_usd_is_a_warning(device, tmp_path, capsys):
     path = write(tmp_path, A)
     path.write_text(path.read_text().replace('defaultPrim = "World"', ""))
     assert check(path).errors == () and len(check(path).broken_rules) == 1
-    errors, [warning] = told(path, tmp_path, device, capsys)
+    errors, [warning] = errors_and_warnings(path, tmp_path, device, capsys)
     assert errors == []
     assert "missing defaultPrim" in warning
