@@ -371,13 +371,20 @@ def test_newton_imports_the_crystal_balls():
     np.testing.assert_allclose(builder.shape_scale[bar], (0.0545, 0.016, 0.016), rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_scenes_run(name):
+@pytest.mark.parametrize(
+    ("name", "balls"),
+    [
+        *((name, None) for name in SCENES if name != "sakura_tree"),
+        ("sakura_tree", 300),
+        pytest.param("sakura_tree", None, marks=pytest.mark.long),
+    ],
+)
+def test_scenes_run(name, balls, tmp_path):
     """A few steps from the bundled stage: nothing overlaps at the start, all stays finite, induction converges."""
     pytest.importorskip("newton")
     from warpmag.engine.stepping.simulation import Simulation  # noqa: PLC0415 - the other tests do without the engine
 
-    simulation = Simulation(bundled()[name], device="cpu")
+    simulation = Simulation(make(name, tmp_path, balls) if balls else bundled()[name], device="cpu")
     assert simulation.statistics.overlapping == 0
     before = simulation.state.body_q.numpy().copy()
     for _ in range(2):
