@@ -1,6 +1,7 @@
 """What ``SECURITY.md`` says of a stage from a stranger."""
 
 import http.server
+import itertools
 import os
 import signal
 import subprocess
@@ -140,10 +141,11 @@ def opened(monkeypatch):
 
 def crossed(rows, columns):
     """Pairs of a row and a column; pairs of neither the first row nor the first column are marked ``long``."""
-    for row in rows:
-        for column in columns:
-            is_short = row == next(iter(rows)) or column == next(iter(columns))
-            yield pytest.param(row, column, marks=() if is_short else pytest.mark.long)
+    first_row, first_column, cases = next(iter(rows)), next(iter(columns)), []
+    for row, column in itertools.product(rows, columns):
+        is_short = row == first_row or column == first_column
+        cases.append(pytest.param(row, column, marks=() if is_short else pytest.mark.long))
+    return cases
 
 
 @pytest.mark.parametrize("chain", CHAINS)
