@@ -92,7 +92,7 @@ def test_what_a_named_material_weighs_is_known_to_both(case, metres, tmp_path):
     assert scene.builder.body_mass[scene.bodies["/World/Ball"]] == pytest.approx(wanted, rel=1e-5)  # single precision
 
 
-@pytest.mark.parametrize(("batch", "workers"), [(1, 1), (1, 3), (5, 2), (50, 4)])
+@pytest.mark.parametrize(("batch", "workers"), [pytest.param(1, 1, marks=pytest.mark.long), (1, 3), (5, 2), (50, 4)])
 def test_a_campaign_survives_its_workers(batch, workers, tmp_path, monkeypatch):
     def judge_or_die(number, seed, folder, *_):
         (folder / f"{number:05}").mkdir(exist_ok=True)
