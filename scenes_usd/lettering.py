@@ -4,6 +4,7 @@ Coordinates are in the plane of the letter, x to the right and y up, in units of
 DejaVu Sans Bold, which is part of Matplotlib (the extra ``plots``).
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -119,8 +120,13 @@ def boxes(curves: list[np.ndarray]) -> list[Box]:
     cover: list[Box] = []
     letter_area = area(curves)
     covered = 0.0
+    gains, best = [math.inf] * len(grids), {}
     while covered < _COVERED * letter_area:
-        gain, box = max((grid.best() for grid in grids), key=lambda pair: pair[0])
+        outdated = set(range(len(grids)))
+        while (first := gains.index(max(gains))) in outdated:  # gains of a grid only fall
+            gains[first], best[first] = grids[first].best()
+            outdated.remove(first)
+        gain, box = gains[first], best[first]
         if gain < _LEAST_GAIN * letter_area:
             break
         covered += gain

@@ -1,8 +1,11 @@
 """Options, markers and fixtures of the whole test suite."""
 
+import atexit
 import functools
 import os
+import shutil
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -10,6 +13,9 @@ from hypothesis import HealthCheck, settings
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # a worker has a core: threads of NumPy's would wait for those of the others
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+if os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):  # tests start many interpreters, which import Newton
+    os.environ["PYTHONPYCACHEPREFIX"] = tempfile.mkdtemp(prefix="warpmag_bytecode_")
+    atexit.register(shutil.rmtree, os.environ["PYTHONPYCACHEPREFIX"], ignore_errors=True)
 FOLDER = Path(__file__).parent
 UNDEFINED = (
     *("alignment", "array-bounds", "bool", "builtin", "enum", "float-cast-overflow", "integer-divide-by-zero"),

@@ -1,6 +1,10 @@
-"""What the ranks of ``test_ranks.py`` do: ``calls PATH DEVICE``, or ``run`` and arguments of the command."""
+"""Program of the ranks of ``test_ranks.py``: ``calls PATH DEVICE``, or ``run`` and arguments of the command.
+
+Several of these follow each other, with ``then`` between them, in one process.
+"""
 
 import sys
+from itertools import groupby
 
 import newton
 import numpy as np
@@ -19,17 +23,24 @@ MANY = {"cpu": 1001, "cuda": 400_000}
 """Those of the fast multipole method: a GPU has to have thousands of cells."""
 
 
-def main(what: str, *arguments: str) -> int:
-    """Do it, with all sums shared out, and say on stderr how often they were merged; return the exit code."""
+def main(*arguments: str) -> int:
+    """Do the parts with all sums shared out; print the numbers of merged sums on stderr, and return the exit code."""
     wp.config.enable_backward = False  # as the tests do, so that both find the same compiled kernels
+    wp.config.log_level = wp.LOG_ERROR  # as the command does
     evaluate._FEWEST_PAIRS_OF_RANKS = dict.fromkeys(evaluate._FEWEST_PAIRS_OF_RANKS, 1)
     all_ranks, merged = current_ranks(), []
     if all_ranks is not None:
         merge = all_ranks.merge
         all_ranks.merge = lambda array: (merged.append(1), merge(array))
-    code = cli.main(["run", *arguments]) if what == "run" else calls(*arguments)
-    print(f"merged {len(merged)}", file=sys.stderr)
-    return code
+    for is_end, words in groupby(arguments, "then".__eq__):
+        if is_end:
+            continue
+        part = [*words]
+        if code := cli.main(part) if part[0] == "run" else calls(*part[1:]):
+            return code
+        print(f"merged {part[0]} {len(merged)}", file=sys.stderr)
+        merged.clear()
+    return 0
 
 
 def calls(path: str, device: str) -> int:

@@ -11,7 +11,7 @@ import warnings
 import newton
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_arguments import GUISES, MS, Unreadable, X, call
 
@@ -234,6 +234,7 @@ def test_any_magnetics(magnets, data):
         assert np.isfinite(force).all() and force[0, 2] < 0.0
 
 
+@settings(max_examples=max(1, settings.default.max_examples // 5))  # a simulation takes a fifth of a second
 @given(st.data())
 def test_any_simulation(device, data):
     """What is taken makes a step, after which the ball is somewhere."""

@@ -1,6 +1,7 @@
 """Cells of one inducible body that is no ball: their demagnetizing tensors, their sizes, and the moment of the body."""
 
 import math
+from functools import cache
 
 import magpylib
 import numpy as np
@@ -134,16 +135,31 @@ def magnetized(solid, susceptibility, device, spacing=0.0, **settings):
     return polarizability(body, susceptibility, device, coupling=coupled(body, [solid]), **settings)
 
 
+@cache
+def ellipsoid_cells(name):
+    """Cells of an ellipsoid, and their coupling."""
+    solid = lattice.ellipsoid(0.01 * np.array(ELLIPSOIDS[name]))
+    body = filled([solid])
+    return body, coupled(body, [solid])
+
+
 @pytest.mark.parametrize("name", ELLIPSOIDS)
 @pytest.mark.parametrize("susceptibility", [10.0, 179.0, math.inf])
 def test_ellipsoids_take_the_moment_of_the_closed_form(device, name, susceptibility):
     """1 %: facets are good to 0.5 % in a uniform field, whatever the cells."""
-    axes = np.array(ELLIPSOIDS[name])
-    result = magnetized(lattice.ellipsoid(0.01 * axes), susceptibility, device, rtol=1e-3)
+    axes, (body, coupling) = np.array(ELLIPSOIDS[name]), ellipsoid_cells(name)
+    result = polarizability(body, susceptibility, device, coupling=coupling, rtol=1e-3)
     np.testing.assert_allclose(result, 1.0 / (demagnetizing_factors(axes) + 1.0 / susceptibility)[[0, 2]], rtol=1e-2)
 
 
-@pytest.mark.parametrize("sides", [(1.0, 1.0, 5.0), (1.0, 1.0, 10.0), (5.0, 5.0, 1.0), (10.0, 10.0, 1.0)])
+@pytest.mark.parametrize(
+    "sides",
+    [
+        (1.0, 1.0, 10.0),
+        (10.0, 10.0, 1.0),
+        *(pytest.param(sides, marks=pytest.mark.long) for sides in ((1.0, 1.0, 5.0), (5.0, 5.0, 1.0))),
+    ],
+)
 def test_rods_and_sheets_take_the_moment_of_a_surface_integral_equation(device, sides):
     """1 % at the default spacing; the reference is good to 0.3 %."""
     result = magnetized(lattice.box(0.5 * np.array(sides)), math.inf, device)
@@ -224,13 +240,15 @@ SLENDER = {
         lattice.ellipsoid([1.0, 1.0, 40.0]),
         lambda chi: 1.0 / (demagnetizing_factors((1.0, 1.0, 40.0))[2] + 1.0 / np.array(chi)),
     ),
-    "bar 30": (
+    "bar 30": (  # the reference takes half a minute
         lattice.box([0.5, 0.5, 15.0]), lambda chi: surface_integrals.box_moments((1.0, 1.0, 30.0), chi, (20, 30))[:, 2]
     ),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", SLENDER)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.long if name == "bar 30" else ()) for name in SLENDER]
+)
 def test_moments_along_slender_bodies_are_those_of_references(name):
     """Their demagnetizing factor is at most 1e-3, so that inconsistent tensors of near and far cells would show."""
     solid, reference = SLENDER[name]

@@ -158,8 +158,8 @@ def folder(scene, tmp_path, monkeypatch):
     return tmp_path
 
 
-def forked(action, messages, on_start=lambda process: None, seconds=60.0):
-    """The exit status of an action in a forked process, which writes its standard files to ``messages``."""
+def fork(action, messages):
+    """Start an action in a forked process, which writes its standard files to ``messages``; return the process."""
     process = os.fork()
     if not process:
         code = 99
@@ -176,8 +176,12 @@ def forked(action, messages, on_start=lambda process: None, seconds=60.0):
             sys.stdout.flush()
             sys.stderr.flush()
             os._exit(code)
+    return process
+
+
+def exit_status(process, seconds=60.0):
+    """Wait for a process and return its exit status, or a text if it does not end."""
     try:
-        on_start(process)
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
             ended, status = os.waitpid(process, os.WNOHANG)
@@ -192,13 +196,33 @@ def forked(action, messages, on_start=lambda process: None, seconds=60.0):
     return "it did not end"
 
 
+def forked(action, messages):
+    """Return the exit status of an action in a forked process, which writes its standard files to ``messages``."""
+    return exit_status(fork(action, messages))
+
+
 def command_of(name, scene):
     places = {"SCENE": str(scene)}
     return [places.get(word, word.replace("OUT", str(scene.parent))) for word in COMMANDS[name]]
 
 
-@pytest.mark.parametrize("kind", HOSTILE, ids=lambda kind: kind.__name__)
-@pytest.mark.parametrize("name", COMMANDS)
+def long_unless(case, is_short):
+    """A case of a test that is marked ``long`` where others show the same in a shorter time."""
+    return pytest.param(*case, marks=() if is_short else pytest.mark.long)
+
+
+HOSTILE_CASES = [
+    long_unless(
+        (name, kind),
+        name == "check" or kind in (crashing, texture) or (name, kind) == ("export package", computed_metadata),
+    )
+    for name in COMMANDS
+    for kind in HOSTILE
+]
+"""All commands read stages in the same way: by default each stage with one command, and two stages with each."""
+
+
+@pytest.mark.parametrize(("name", "kind"), HOSTILE_CASES, ids=lambda value: getattr(value, "__name__", value))
 def test_a_hostile_stage_is_one_line_of_each_command(name, kind, folder):
     kind(folder)
     code = forked(lambda: cli.main(command_of(name, folder / "scene.usda")), folder / "messages")
@@ -207,8 +231,15 @@ def test_a_hostile_stage_is_one_line_of_each_command(name, kind, folder):
     assert lines[0].startswith("warpmag: ") and HOSTILE[kind] in lines[0]
 
 
-@pytest.mark.parametrize("kind", [crashing, computed_pipe], ids=lambda kind: kind.__name__)
-@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        long_unless((name, kind), kind is crashing or name == "open_stage")
+        for name in FUNCTIONS
+        for kind in (crashing, computed_pipe)
+    ],
+    ids=lambda value: getattr(value, "__name__", value),
+)
 def test_a_hostile_stage_is_one_line_of_each_function(name, kind, folder):
     kind(folder)
     code = forked(lambda: FUNCTIONS[name](folder / "scene.usda") and 0, folder / "messages")
@@ -306,10 +337,9 @@ def endless(begin):
     collections.deque(itertools.chain(map(os.write, [begin], [b"."]), range(10**13)), maxlen=0)
 
 
-def interrupted(action, number, messages):
-    """The exit status of an action, and the seconds from a signal to it; ``action`` writes a byte when it has begun."""
+def interrupt(action, number, messages):
+    """Fork an action and send it a signal when it has written a byte; return the process and the time of the signal."""
     reader, writer = os.pipe()
-    sent = []
 
     def act():
         for default in SIGNALS:
@@ -317,19 +347,26 @@ def interrupted(action, number, messages):
         signal.signal(signal.SIGINT, signal.default_int_handler)
         return action(writer)
 
-    def send(process):
-        os.close(writer)
-        assert os.read(reader, 1) == b"."
-        sent.append(time.monotonic())
-        os.kill(process, number)
-
-    code = forked(act, messages, on_start=send)
+    process = fork(act, messages)
+    os.close(writer)
+    begun = os.read(reader, 1)
     os.close(reader)
-    return code, time.monotonic() - sent[0]
+    if begun != b".":
+        pytest.fail(f"it did not begin: {exit_status(process)}, {messages.read_text()}")
+    os.kill(process, number)
+    return process, time.monotonic()
 
 
-@pytest.mark.parametrize("way", SIGNALS)
-@pytest.mark.parametrize("name", PHASES)
+def interrupted(action, number, messages):
+    """Return the exit status of an action, and the seconds from a signal to its end."""
+    process, sent = interrupt(action, number, messages)
+    return exit_status(process), time.monotonic() - sent
+
+
+@pytest.mark.parametrize(
+    ("name", "way"),
+    [long_unless((name, way), name == "check" or way == "SIGTERM") for name in PHASES for way in SIGNALS],
+)
 def test_a_signal_ends_native_code_of_each_command(name, way, folder, monkeypatch):
     """In about a second; the limit is for a loaded machine."""
     module, function = PHASES[name]
@@ -361,32 +398,36 @@ def test_a_signal_ends_a_trial_read_that_waits(way, folder, monkeypatch):
         os.open(folder / "odd.usda", os.O_WRONLY | os.O_NONBLOCK)
 
 
-@pytest.mark.parametrize("way", SIGNALS)
-@pytest.mark.parametrize("seconds", [3.0, 60.0])
-def test_a_command_that_reacts_has_time_to_close_its_files(seconds, way, folder, monkeypatch):
+def test_a_command_that_reacts_has_time_to_close_its_files(folder, monkeypatch):
     """Three seconds are enough; a minute is cut to the limit."""
     monkeypatch.setattr(terminal, "_ENDING", 6.0)
-    number = getattr(signal, way)
 
-    def close_slowly(begin):
-        try:
-            os.write(begin, b".")
-            time.sleep(100.0)
-        finally:
-            end = time.monotonic() + seconds
-            while time.monotonic() < end:
-                time.sleep(0.1)
+    def command(seconds):
+        def close_slowly(begin):
+            try:
+                os.write(begin, b".")
+                time.sleep(100.0)
+            finally:
+                end = time.monotonic() + seconds
+                while time.monotonic() < end:
+                    time.sleep(0.1)
 
-    def act(begin):
-        cli._materials = lambda _: close_slowly(begin)
-        return cli.main(["materials"])
+        def act(begin):
+            cli._materials = lambda _: close_slowly(begin)
+            return cli.main(["materials"])
 
-    code, lasted = interrupted(act, number, folder / "messages")
-    assert code == (128 + number if seconds < 6.0 else -signal.SIGKILL) and lasted < 12.0
+        return act
+
+    numbers = [getattr(signal, way) for way in SIGNALS]
+    cases = [(seconds, number) for seconds in (3.0, 60.0) for number in numbers]
+    files = [folder / f"messages{k}" for k in range(len(cases))]
+    started = [interrupt(command(case[0]), case[1], file) for case, file in zip(cases, files, strict=True)]
+    for (seconds, number), (process, sent) in zip(cases, started, strict=True):  # all wait at the same time
+        code, lasted = exit_status(process), time.monotonic() - sent
+        assert code == (128 + number if seconds < 6.0 else -signal.SIGKILL) and lasted < 12.0, (seconds, number)
 
 
-@pytest.mark.parametrize("way", SIGNALS)
-def test_a_frame_is_written_before_the_end(way, folder):
+def test_a_frame_is_written_before_the_end(folder):
     """Python delays a signal while it writes a frame, however long that takes."""
 
     def act(begin):
@@ -401,10 +442,12 @@ def test_a_frame_is_written_before_the_end(way, folder):
         cli._materials = write_slowly
         return cli.main(["materials"])
 
-    number = getattr(signal, way)
-    code, seconds = interrupted(act, number, folder / "messages")
-    assert code == 128 + number and seconds > 2.9
-    assert "went on" not in (folder / "messages").read_text()
+    numbers = [getattr(signal, way) for way in SIGNALS]
+    started = [interrupt(act, number, folder / f"messages{number}") for number in numbers]
+    for number, (process, sent) in zip(numbers, started, strict=True):
+        code, seconds = exit_status(process), time.monotonic() - sent
+        assert code == 128 + number and seconds > 2.9, number
+        assert "went on" not in (folder / f"messages{number}").read_text()
 
 
 def test_other_signals_and_other_handlers_are_left_alone(folder):

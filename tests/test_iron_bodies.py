@@ -86,8 +86,21 @@ def test_two_balls_in_contact(device):
     assert magnetics.converged.numpy().all()
 
 
-@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0)], ids=["across", "along"])
-@pytest.mark.parametrize("size", [(0.03, 0.001), (0.04, 0.001), (0.04, 0.0012)], ids=str)
+ACROSS, ALONG = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("size", "direction"),
+    [
+        ((0.03, 0.001), ACROSS),
+        ((0.04, 0.0012), ALONG),
+        pytest.param((0.03, 0.001), ALONG, marks=pytest.mark.long),
+        pytest.param((0.04, 0.0012), ACROSS, marks=pytest.mark.long),
+        pytest.param((0.04, 0.001), ACROSS, marks=pytest.mark.long),
+        pytest.param((0.04, 0.001), ALONG, marks=pytest.mark.long),
+    ],
+    ids=str,
+)
 def test_equal_sheets_that_lie_on_each_other_converge(size, direction, device):
     """Sheets of one layer, cell on cell: differences across the layer would make the operator indefinite."""
     side, thickness = size
@@ -118,8 +131,21 @@ def solved_boxes(sizes, angles, susceptibility, field, device):
     return magnetics.evaluations.numpy().max(), magnetics.converged.numpy().all()
 
 
-@pytest.mark.parametrize("count", [2, 3, 5])
-@pytest.mark.parametrize("size", [(0.03, 0.03, 0.001), (0.05, 0.02, 0.002)], ids=["one layer", "two layers"])
+ONE_LAYER, TWO_LAYERS = (0.03, 0.03, 0.001), (0.05, 0.02, 0.002)
+
+
+@pytest.mark.parametrize(
+    ("size", "count"),
+    [
+        (ONE_LAYER, 2),
+        (ONE_LAYER, 5),
+        (TWO_LAYERS, 3),
+        pytest.param(ONE_LAYER, 3, marks=pytest.mark.long),
+        pytest.param(TWO_LAYERS, 2, marks=pytest.mark.long),
+        pytest.param(TWO_LAYERS, 5, marks=pytest.mark.long),
+    ],
+    ids=str,
+)
 def test_stacks_of_sheets_without_saturation_converge(size, count, device):
     """With the energy of linear parts deep in a body, or without larger sizes, three and five do not converge."""
     evaluations, converged = solved_boxes([size] * count, [0.0] * count, 5000.0, (1e4, 2e4, 5e3), device)

@@ -4,6 +4,7 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
+from test_engine_xpbd import search
 
 import warpmag
 from warpmag.engine.pile_xpbd.xpbd import PileXPBD
@@ -49,9 +50,8 @@ def test_all_contacts_together_overshoot_less_than_momentum_bears(friction, devi
     model = heap(device, friction).finalize(device=device)
     model.joint_count = 0
     state = model.state()
-    pipeline = newton.CollisionPipeline(model, rigid_contact_max=1000)
-    contacts = pipeline.contacts()
-    pipeline.collide(state, contacts)
+    pipeline, contacts = search(model)
+    pipeline.collide(state, contacts, dt=DT)
     solver = PileXPBD(model, 1000, rigid_contact_relaxation=RELAXATION, rigid_contact_con_weighting=False)
     solver.step(state, model.state(), None, contacts, DT)
     shares = solver._shares.numpy().astype(float)
@@ -105,9 +105,8 @@ def test_a_hinge_elsewhere_changes_no_shares(device):
             builder.add_shape_sphere(arm, radius=R)
             builder.add_articulation([builder.add_joint_revolute(-1, arm, axis=(0.0, 0.0, 1.0))])
         model = builder.finalize(device=device)
-        pipeline, state = newton.CollisionPipeline(model), model.state()
-        contacts = pipeline.contacts()
-        pipeline.collide(state, contacts)
+        (pipeline, contacts), state = search(model), model.state()
+        pipeline.collide(state, contacts, dt=DT)
         pull = np.zeros((model.body_count, 6), np.float32)
         pull[0, 2] = -2.0 * 5e-4 / DT**2 * model.body_mass.numpy()[0]  # closes the gaps twice over
         state.body_f.assign(pull)

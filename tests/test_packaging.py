@@ -109,6 +109,7 @@ def test_source_distribution_has_all_that_its_tests_need(distribution):
     assert {*expected, *FILES} - held == set()
 
 
+@pytest.mark.long
 def test_tests_of_the_source_distribution_run(environment, distribution, tmp_path):
     """Where it is unpacked, of the packages that are there; what these ask for is installed."""
     tools = tmp_path / "tools"

@@ -2,7 +2,6 @@
 
 import importlib.util
 import os
-import shutil
 import subprocess
 import sys
 import sysconfig
@@ -14,6 +13,7 @@ import warp as wp
 
 from warpmag.errors import InputError
 from warpmag.moments.ranks import Ranks
+from warpmag.scenes_usd import balls_up, sakura_tree
 
 MPIRUN = Path(sysconfig.get_path("scripts"), "mpirun")
 SCRIPT = Path(__file__).with_name("ranks_program.py")
@@ -38,28 +38,40 @@ def start(ranks: int, *command):
     )  # fmt: skip
 
 
-def merged(done) -> list[int]:
-    """How often the sums of each rank were merged."""
-    return [int(line.split()[1]) for line in done.stderr.splitlines() if line.startswith("merged ")]
+def merged(done, part) -> list[int]:
+    """How often the sums of each rank were merged in a part of the program."""
+    return [int(line.split()[2]) for line in done.stderr.splitlines() if line.startswith(f"merged {part} ")]
+
+
+def run_command(folder, device, ranks, sums):
+    """Words of the program that run a scene with some sums; the scene is written into ``folder``."""
+    scene = folder / "scene.usdc"
+    if device == "cpu":
+        balls_up.author(scene, columns=5, rows=5, layers=2)
+    else:  # as many as a GPU shares out
+        sakura_tree.author(scene, balls=6000 if sums == "direct" else 400_000)
+    command = ["run", scene, "-o", folder / f"{ranks}" / "out.usda", "--frames", 1, "--method", sums]
+    return [*command, *([] if "cuda" in device else ["--device", device])]
 
 
 @pytest.fixture(scope="module")
 def calls(tmp_path_factory, device):
-    """What came of one process and of two that call functions, and the results of each of the three."""
+    """Results of one process and of two that call functions, then run a scene; those of calls of each process."""
     folder, done, results = tmp_path_factory.mktemp("calls"), [], []
     for ranks in (1, 2):
-        done.append(start(ranks, "-m", "mpi4py", SCRIPT, "calls", folder / f"of_{ranks}", device[:4]))
+        run = run_command(folder, device, ranks, "direct")
+        done.append(start(ranks, "-m", "mpi4py", SCRIPT, "calls", folder / f"of_{ranks}", device[:4], "then", *run))
         assert done[-1].returncode == 0, done[-1].stderr
         for rank in range(ranks):
             with np.load(folder / f"of_{ranks}_{rank}.npz") as saved:
                 results.append(dict(saved))
-    return done, results
+    return done, results, folder
 
 
 def test_two_ranks_end_with_the_bits_of_one(calls, device):
-    done, (single, *two) = calls
-    assert merged(done[0]) == [0]
-    first, second = merged(done[1])
+    done, (single, *two), _ = calls
+    assert merged(done[0], "calls") == [0]
+    first, second = merged(done[1], "calls")
     # on a CPU some 14 sums of 3 sizes, and those of the worlds; a GPU shares out those of thousands of moments only
     assert first == second > (40 if device == "cpu" else 4)
     for other in two:
@@ -95,25 +107,21 @@ def test_a_difference_raises_an_error_of_one_line_on_all_ranks(calls):
         assert {f"{rank} {name}: {line}" for rank in range(2)} <= set(printed), name
 
 
-@pytest.mark.parametrize("sums", ["direct", pytest.param("fmm", marks=pytest.mark.long)])
-def test_a_run_by_two_ranks_writes_the_bits_of_one(tmp_path, device, sums):
-    from warpmag.scenes_usd import bundled, sakura_tree  # noqa: PLC0415
+def summary(done) -> list[str]:
+    """Lines of a run, without those of calls, which begin with the rank."""
+    return [line for line in done.stdout.splitlines() if line[:2] not in ("0 ", "1 ")]
 
-    scene, runs = tmp_path / "scene.usdc", []
-    if device == "cpu":
-        shutil.copyfile(bundled()["balls_up"], scene)
-    else:  # as many as a GPU shares out
-        sakura_tree.author(scene, balls=6000 if sums == "direct" else 400_000)
-    for ranks in (1, 2):
-        out = tmp_path / f"{ranks}" / "out.usda"
-        command = [SCRIPT, "run", scene, "-o", out, "--frames", 1, "--method", sums]
-        done = start(ranks, *command, *([] if "cuda" in device else ["--device", device]))
-        assert done.returncode == 0, done.stderr
-        runs.append(done)
+
+@pytest.mark.parametrize("sums", ["direct", pytest.param("fmm", marks=pytest.mark.long)])
+def test_a_run_by_two_ranks_writes_the_bits_of_one(calls, tmp_path, device, sums):
+    runs, _, folder = calls
+    if sums != "direct":
+        runs, folder = [start(n, SCRIPT, *run_command(tmp_path, device, n, sums)) for n in (1, 2)], tmp_path
+        assert [done.returncode for done in runs] == [0, 0], [done.stderr for done in runs]
     # fields and forces of substeps; of a GPU those that are captured
-    assert merged(runs[0]) == [0] and min(merged(runs[1])) > (30 if device == "cpu" else 0)
-    assert runs[0].stdout.count("\n") == runs[1].stdout.count("\n")  # only rank 0 prints
-    first, second = ((tmp_path / f"{ranks}" / "out.cache.usdc").read_bytes() for ranks in (1, 2))
+    assert merged(runs[0], "run") == [0] and min(merged(runs[1], "run")) > (30 if device == "cpu" else 0)
+    assert len(summary(runs[0])) == len(summary(runs[1])) > 0  # only rank 0 prints
+    first, second = ((folder / f"{ranks}" / "out.cache.usdc").read_bytes() for ranks in (1, 2))
     assert first == second
 
 

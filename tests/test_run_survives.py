@@ -10,6 +10,7 @@ import json
 import math
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -167,11 +168,16 @@ class Survival:
         assert sorted(os.listdir(self.output.parent)) == ["out.cache.usdc", "out.usda"]
 
 
+def checkpoint_each_frame(patch):
+    """Write a checkpoint after every frame."""
+    patch.setattr("warpmag.usd.write.writer._CHECKPOINT_SECONDS", 0.0)
+    patch.setattr("warpmag.usd.write.writer._CHECKPOINT_SHARE", math.inf)
+
+
 @pytest.fixture
 def always(monkeypatch):
     """A checkpoint after every frame."""
-    monkeypatch.setattr("warpmag.usd.write.writer._CHECKPOINT_SECONDS", 0.0)
-    monkeypatch.setattr("warpmag.usd.write.writer._CHECKPOINT_SHARE", math.inf)
+    checkpoint_each_frame(monkeypatch)
 
 
 @pytest.mark.parametrize(
@@ -417,12 +423,30 @@ def test_fifty_random_moments(scene, tmp_path, way):
     survival.server.close()
 
 
+@pytest.fixture(scope="module")
+def ended_runs(scene, device, tmp_path_factory):
+    """Two runs that ended early, with a checkpoint."""
+    folder = tmp_path_factory.mktemp("ended")
+    with pytest.MonkeyPatch.context() as patch:
+        checkpoint_each_frame(patch)
+        for name, frames, last in (("out", 4, 2), ("other", 40, 3)):
+            Simulation(scene, device=device).run(
+                frames, output=folder / name / "out.usda", on_frame=lambda frame, last=last: frame < last
+            )
+    return folder
+
+
+@pytest.fixture
+def ended(ended_runs, tmp_path):
+    """The output of a copy of the first run, beside a copy of the other one; the scene is as far away."""
+    shutil.copytree(ended_runs, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "out" / "out.usda"
+
+
 @pytest.mark.parametrize("place", [0.02, 0.3, 0.6, 0.9, 0.97])
-def test_a_damaged_cache_is_refused_or_readable(place, scene, tmp_path, device, always, capsys):
+def test_a_damaged_cache_is_refused_or_readable(place, scene, ended, device, always, capsys):
     """Zeros in the cache: USD opens the result of a resumed run, or the run is refused in one line."""
-    output = tmp_path / "out.usda"
-    Simulation(scene, device=device).run(4, output=output, on_frame=lambda frame: frame < 2)
-    cache = tmp_path / "out.cache.usdc"
+    output, cache = ended, ended.with_name("out.cache.usdc")
     content = bytearray(cache.read_bytes())
     begin = int(place * len(content))
     content[begin : begin + 512] = bytes(len(content[begin : begin + 512]))
@@ -449,15 +473,10 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("kind", FOREIGN)
-def test_a_foreign_checkpoint_is_refused_and_nothing_written(kind, scene, tmp_path, device, always, capsys):
-    for name, frames, last in (("out", 4, 2), ("other", 40, 3)):
-        Simulation(scene, device=device).run(
-            frames, output=tmp_path / name / "out.usda", on_frame=lambda frame, last=last: frame < last
-        )
+def test_a_foreign_checkpoint_is_refused_and_nothing_written(kind, scene, ended, tmp_path, device, always, capsys):
     saved, other = (dict(np.load(tmp_path / name / "out.resume.npz")) for name in ("out", "other"))
     np.savez(tmp_path / "out" / "out.resume.npz", **FOREIGN[kind](saved, other))
-    cache = (tmp_path / "out" / "out.cache.usdc").read_bytes()
-    output = tmp_path / "out" / "out.usda"
+    output, cache = ended, ended.with_name("out.cache.usdc").read_bytes()
     assert cli.main(["run", str(scene), "--frames", "4", "-o", str(output), "--device", device, "--resume"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("warpmag: ") and "resume" in line
@@ -465,11 +484,10 @@ def test_a_foreign_checkpoint_is_refused_and_nothing_written(kind, scene, tmp_pa
     assert len(frames_of(output)) == 3
 
 
-def test_damaged_references_are_repaired_and_values_recognized(scene, tmp_path, device, always, capsys):
+def test_damaged_references_are_repaired_and_values_recognized(scene, ended, device, always, capsys):
     """The places of a frame's values are known without the file; the values themselves have a checksum."""
-    output = tmp_path / "out.usda"
-    Simulation(scene, device=device).run(4, output=output, on_frame=lambda frame: frame < 2)
-    places, cache = dict(np.load(tmp_path / "out.resume.npz")), tmp_path / "out.cache.usdc"
+    output, cache = ended, ended.with_name("out.cache.usdc")
+    places = dict(np.load(ended.with_name("out.resume.npz")))
     content = cache.read_bytes()
     row, value = int(places["file/times"]) + 8 * (1 + int(places["file/capacity"])) + 16, int(places["file/starts"][0])
 

@@ -1,6 +1,7 @@
 """Wild calls of every public function of builders, models, states and arrays, in child processes: a crash counts.
 
-Six of each by default; as many as wanted with ``python -m tests.fuzz.calls``.
+Four of each by default, one in each kind of world, and six with ``--long``; as many as wanted with
+``python -m tests.fuzz.calls``.
 """
 
 import inspect
@@ -29,14 +30,16 @@ def kernels():
 
 
 @pytest.mark.parametrize("owner", [*functions.OWNERS, "functions"])
-def test_wild_calls_are_refused_or_finite(owner, device):
+def test_wild_calls_are_refused_or_finite(owner, device, request):
     if device != "cpu":
         pytest.skip("a GPU does not survive a fork")
     names = [
         name for name in functions.targets() if (name.partition(".")[0] in functions.OWNERS) == (owner != "functions")
     ]
     names = [name for name in names if owner in ("functions", name.partition(".")[0])]
-    count, step = (3, 1) if owner in HEAVY else (6, worlds.OFTEN)  # else each in a world of another kind
+    count, step = (2, 1) if owner in HEAVY else (4, worlds.OFTEN)  # else each in a world of another kind
+    if request.config.getoption("--long"):
+        count += count // 2
     numbers = [*range(0, count * step, step)]
     results = [outcome for name in names for outcome in children.outcomes(name, 7, numbers)]
     assert [(outcome.number, outcome.call, outcome.problem) for outcome in results if outcome.problem] == []

@@ -198,9 +198,11 @@ def _fit_steps(part: Solid, fit: np.ndarray, across: int) -> np.ndarray:
     extent, result = part.upper - part.lower, fit.copy()
     for axis in range(3):
         coordinate, area = part.steps[part.steps[:, 0] == axis, 1:].T
+        if not len(coordinate):
+            continue
         least = max(int(np.ceil(fit[axis] / _WIDEST)), min(int(fit[axis]), across))
         counts = np.arange(least, int(fit[axis] * _WIDEST) + 1)
-        if not len(coordinate) or len(counts) < 2:
+        if len(counts) < 2:
             continue
         heights = counts[:, None] * ((coordinate - part.lower[axis]) / extent[axis])
         shares = area / np.delete(extent, axis).prod()
