@@ -1,4 +1,4 @@
-"""Distances over which the magnetic forces on fast bodies vary, from the gaps to all other magnets.
+"""Distances over which the magnetic forces on fast bodies vary, from the gaps to all other magnets and coils.
 
 The force on a body far from other magnets varies over a longer distance than in contact. So substeps may share forces
 for longer: fragments that fly apart need no solve in each short substep.
@@ -19,21 +19,26 @@ _THREADS = 32  # threads of a GPU that measure the gaps of a shape
 
 @wp.struct
 class MagneticShapes:
-    """Magnetic shapes of a model, m of them, and its arrays of all shapes."""
+    """Magnets and coils of a model, m of them, which are shapes, and its arrays of all shapes."""
 
-    shape: wp.array[wp.int32]  # magnetic shapes, shape [m]
+    shape: wp.array[wp.int32]  # shapes that are magnets or coils, shape [m]
+    radius: wp.array[float]  # radius of a ball around the frame of each that contains it [m], shape [m]
+    longest: float  # longest distance over which the field of maps varies [m]
     body: wp.array[wp.int32]  # body of each shape, -1 for the world, shape [shapes]
     world: wp.array[wp.int32]  # world of each shape, -1 for all worlds, shape [shapes]
     frame: wp.array[wp.transform]  # pose on its body, shape [shapes]
-    radius: wp.array[float]  # radius of a ball around its frame that contains the shape [m], shape [shapes]
 
 
-def magnetic_shapes(model, shapes) -> MagneticShapes:
-    """Return the magnetic shapes ``shapes`` of a Newton model."""
+def magnetic_shapes(model, shapes, radii, spacing: float) -> MagneticShapes:
+    """Return the shapes of a Newton model that are magnets or coils, with their ``radii`` [m].
+
+    ``spacing`` is the shortest distance between nodes of field maps [m].
+    """
     magnets = MagneticShapes()
     magnets.shape = wp.array(shapes, dtype=wp.int32, device=model.device)
-    magnets.body, magnets.world = model.shape_body, model.shape_world
-    magnets.frame, magnets.radius = model.shape_transform, model.shape_collision_radius
+    magnets.radius = wp.array(radii, dtype=float, device=model.device)
+    magnets.longest = _SHARE * spacing
+    magnets.body, magnets.world, magnets.frame = model.shape_body, model.shape_world, model.shape_transform
     return magnets
 
 
@@ -45,9 +50,10 @@ def _is_fast(m: Monitor, bodies: BodyView, body: int, longest: float) -> bool:
 
 
 @wp.kernel
-def _begin_spans(m: Monitor, bodies: BodyView, longest: float):
+def _begin_spans(m: Monitor, bodies: BodyView, magnets: MagneticShapes, longest: float):
     body = wp.tid()
-    m.force_span[body] = wp.where(_is_fast(m, bodies, body, longest), wp.inf, m.force_length[body])
+    length = m.force_length[body]
+    m.force_span[body] = wp.where(_is_fast(m, bodies, body, longest), wp.max(length, magnets.longest), length)
 
 
 @wp.func
@@ -58,7 +64,8 @@ def _center(magnets: MagneticShapes, bodies: BodyView, shape: int) -> wp.vec3:
 
 @wp.kernel
 def _measure_spans(m: Monitor, bodies: BodyView, magnets: MagneticShapes, longest: float, threads: int):
-    own = magnets.shape[wp.tid() // threads]
+    index = wp.tid() // threads
+    own = magnets.shape[index]
     body = magnets.body[own]
     if body < 0:
         return
@@ -71,7 +78,7 @@ def _measure_spans(m: Monitor, bodies: BodyView, magnets: MagneticShapes, longes
         apart = magnets.world[other] >= 0 and magnets.world[own] >= 0 and magnets.world[other] != magnets.world[own]
         if magnets.body[other] != body and not apart:
             distance = wp.length(_center(magnets, bodies, other) - center)
-            gap = wp.min(gap, distance - magnets.radius[own] - magnets.radius[other])
+            gap = wp.min(gap, distance - magnets.radius[index] - magnets.radius[k])
     wp.atomic_min(m.force_span, body, wp.max(m.force_length[body], wp.static(_SHARE) * gap))
 
 
@@ -82,6 +89,6 @@ def measure_force_spans(m: Monitor, bodies: BodyView, magnets: MagneticShapes, l
     """
     device = m.peaks.device
     threads = _THREADS if device.is_cuda else 1
-    wp.launch(_begin_spans, len(m.force_span), inputs=[m, bodies, longest], device=device)
+    wp.launch(_begin_spans, len(m.force_span), inputs=[m, bodies, magnets, longest], device=device)
     inputs = [m, bodies, magnets, longest, threads]
     wp.launch(_measure_spans, threads * len(magnets.shape), inputs=inputs, device=device)

@@ -7,6 +7,7 @@ copies of a shape keep its text.
 
 import base64
 import json
+import math
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, NamedTuple
@@ -116,6 +117,19 @@ class SourceRecord:
             corners = self.table[:-1] if closed else self.table
             return Coil("polyline", points=tuple(map(tuple, corners.tolist())), closed=closed, **shared)
         return Coil(self.kind, radius=p[0], length=2.0 * p[1] if self.kind == "solenoid" else 0.0, **shared)
+
+    def radius(self) -> float:
+        """Return the radius of a ball around the frame's origin that contains the coil, 0 for a field map [m]."""
+        if self.kind == "field_map":
+            return 0.0
+        farthest = (
+            np.linalg.norm(self.table, axis=1).max() if self.kind == "polyline" else math.hypot(*self.parameters[:-1])
+        )
+        return float(farthest) + self.parameters[-1]  # the wire's radius
+
+    def spacing(self) -> float:
+        """Return the shortest distance between nodes of a field map, infinite for a coil [m]."""
+        return min(self.parameters[3:6]) if self.kind == "field_map" else math.inf
 
     @classmethod
     def from_text(cls, text: str) -> "SourceRecord":

@@ -34,6 +34,7 @@ from warpmag.kernels.rigid.bodies import (
     set_external_field,
     set_magnetization,
 )
+from warpmag.kernels.rigid.force_spans import MagneticShapes, magnetic_shapes
 from warpmag.kernels.rigid.worlds import number_worlds
 from warpmag.moments.arrays import (
     CallContext,
@@ -219,10 +220,12 @@ class Magnetics:
         """True if forces depend on velocities, ``State.body_qd``, because a magnet conducts."""
         return self.system.eddy is not None
 
-    @property
-    def has_sources(self) -> bool:
-        """True if coils or field maps act on the magnets."""
-        return bool(self._sources.applied)
+    def magnetic_shapes(self) -> MagneticShapes:
+        """Return the magnets and coils, from whose distances a simulation finds how long substeps may share forces."""
+        radii = self._model.shape_collision_radius.numpy()[self.shapes]
+        coils = {k: radius for k, radius in zip(self._sources.shapes, self._sources.radii, strict=True) if radius > 0.0}
+        shapes, spacing = [*self.shapes, *coils], self._sources.spacing
+        return magnetic_shapes(self._model, shapes, [*radii, *coils.values()], spacing)
 
     def field_error(self) -> float:
         """Return the relative error of the last field that the fast multipole method summed; 0 for direct sums.

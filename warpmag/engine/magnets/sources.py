@@ -1,6 +1,7 @@
 """The coils and field maps of a finished Newton model: their frames, strengths and reactions on bodies."""
 
 import fnmatch
+import math
 import re
 
 import newton
@@ -31,6 +32,8 @@ class ModelSources:
     Attributes:
         shapes: Shapes that represent sources, in the order of ``applied``.
         applied: The sources as a :class:`MomentSystem` takes them.
+        radii, spacing: Radii of balls that contain the coils, 0 for field maps, and the shortest distance between nodes
+            of field maps [m].
         circuits: Coils with a resistance, None without any; set by :meth:`bind`.
         on_device: Their shapes and bodies, after :meth:`bind`.
     """
@@ -56,6 +59,8 @@ class ModelSources:
             self.shapes.append(shape)
             self._records.append(record)
             self.applied.append(AppliedSource(kind, record.parameters, record.table, world, body, movable))
+        self.radii = [record.radius() for record in self._records]
+        self.spacing = min((record.spacing() for record in self._records), default=math.inf)
 
     def bind(self, system: MomentSystem) -> None:
         """Set the system that the other methods write to; it was made with :attr:`applied`."""

@@ -32,7 +32,7 @@ from warpmag.engine.stepping.state_rows import state_rows
 from warpmag.errors import InputError, SimulationError
 from warpmag.kernels.rigid import monitor, stepping
 from warpmag.kernels.rigid.bodies import predict_poses
-from warpmag.kernels.rigid.force_spans import magnetic_shapes, measure_force_spans
+from warpmag.kernels.rigid.force_spans import measure_force_spans
 from warpmag.kernels.rigid.newton_views import view_bodies
 from warpmag.moments.arrays import PersistentArray, restore_snapshot, snapshot_views
 
@@ -117,8 +117,7 @@ class Stepper:
         )
         self._arrays = self._machine.arrays
         self._watched = self._machine.make_monitor(sizes.thickness, sizes.force_length, sizes.reach)
-        # the field of a coil or map may vary over a short distance anywhere
-        self._magnets = None if magnetics.has_sources else magnetic_shapes(model, magnetics.shapes)
+        self._magnets = magnetics.magnetic_shapes()
         self._mirrors = {name: getattr(self._arrays, name) for name in ("status", "peaks", "counts", "log")}
         if self._device.is_cuda:
             copies = {name: wp.empty_like(array, device="cpu", pinned=True) for name, array in self._mirrors.items()}
@@ -407,8 +406,7 @@ class Stepper:
         monitor.watch_induction(self._watched, magnetics.error, magnetics.evaluations, magnetics.converged)
         magnetics.add_forces(state)
         bodies = view_bodies(self._model, state)
-        if self._magnets is not None:
-            measure_force_spans(self._watched, bodies, self._magnets, self._longest)
+        measure_force_spans(self._watched, bodies, self._magnets, self._longest)
         monitor.watch_forces(self._watched, bodies, self._model.gravity, self._longest)
 
 
