@@ -13,7 +13,7 @@ from cell_bodies import (
 from scipy.spatial.transform import Rotation
 
 from bench.systems import moment_system
-from warpmag.shapes import demagnetization, lattice, linear_cells
+from warpmag.shapes import demagnetization, lattice
 
 
 def test_flat_cells_of_thin_plates_keep_the_operator_positive(monkeypatch):
@@ -155,20 +155,3 @@ def test_permanent_ball_around_iron_adds_no_demagnetization(device):
             fields.append(system.h.numpy()[: 2 * n].copy())
     # positions are rounded to float32, and the field of the spread moment is 1e3 times that of the iron
     np.testing.assert_allclose(fields[2] - fields[3], fields[0] - fields[1], atol=1e-6 * np.abs(fields[2]).max())
-
-
-def test_the_curl_of_cells_is_that_of_linear_magnetizations():
-    """Its energy is factor μ0 (l curl M)²/2, in cells inside the body; a gradient has none, also at the surface."""
-    body = lattice.fill(lattice.box([1.0, 0.8, 0.6]), 0.2, together=True)
-    (part,), coupling = body.pieces, demagnetization.coupling(body, body.radii)
-    index = linear_cells._cell_indices(part)
-    volumes = body.volumes / part.sides.prod()
-    neighbors = linear_cells._neighbors(index, volumes)
-    operator = linear_cells._Operator(coupling, part, index, body.volumes, *neighbors)
-    x, y, _ = body.positions.T
-    root, side = np.sqrt(body.volumes), part.sides[0]
-    inside = (np.abs(body.positions) + part.sides < [1.0, 0.8, 0.6]).all(axis=1)
-    curl = operator._curl(2, part.sides)
-    turning = curl[0] @ (root * -y) + curl[1] @ (root * x)
-    np.testing.assert_allclose(turning[inside], root[inside] * 2.0 * side, rtol=1e-9)  # rounding
-    np.testing.assert_allclose(curl[0] @ (root * y) + curl[1] @ (root * x), 0.0, atol=1e-9 * side)
