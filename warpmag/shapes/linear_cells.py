@@ -60,7 +60,9 @@ LEAST_CELLS = 65
 (``uniform_response.py``)."""
 _CURL = 0.004
 """Demagnetizing factor of the curl. It removes 1 % of the force between letters in contact. At a third of it, five
-discs in a stack do not converge."""
+discs in a stack do not converge. Cylinders side by side at 0.2 mm attract each other 11 % too weakly, 6 % with half of
+it and 1 % with a quarter. With the curl of each cell, from its neighbors on both sides, and a factor of 0.005, it would
+be 7 %. But a stack of five sheets of two layers would not converge, not even with 0.008."""
 _WITHIN_HALF = 1.0 / 3.0
 """Demagnetizing factor of the linear part within a half, for the difference D M, deep in a body."""
 
