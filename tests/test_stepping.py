@@ -1,12 +1,16 @@
 """The state machine of a step against its rules in Python."""
 
+import math
+
 import newton
 import numpy as np
 import pytest
 import warp as wp
 
+import warpmag
 from warpmag.engine.pile_xpbd.contacts import RigidSolver, body_sizes
 from warpmag.kernels.rigid import monitor, stepping
+from warpmag.kernels.rigid.force_spans import measure_force_spans
 from warpmag.kernels.rigid.newton_views import BodyView, view_bodies
 
 TRAVEL, SHARED_TRAVEL, OVERLAP, EASE, FUTILE, FEWEST, CAPACITY = 0.25, 1.0, 0.008, 0.8, 0.8, 2, 100
@@ -308,3 +312,38 @@ def test_a_sheet_may_move_by_more_than_its_thickness_while_forces_are_shared(mov
     peaks = watched.peaks.numpy()
     assert peaks[monitor.PEAK_LONG_TRAVEL] == pytest.approx(moved / 0.01, rel=1e-3)
     assert peaks[monitor.PEAK_FORCE_TRAVEL] == pytest.approx(moved / (1.0 * 0.8 * 0.01) ** (1 / 3), rel=1e-3)
+
+
+SPANS = {  # speed of one of two balls [m/s], what else there is, and the distance over which forces on it vary [m]
+    "slow": (0.9, None, 0.01),
+    "fast": (20.0, None, 0.5 * (0.3 - 0.02)),
+    "fast beside a coil": (20.0, "coil", 0.5 * (0.1 - 0.01 - 0.021)),
+    "fast in a field map": (20.0, "map", 0.5 * 0.05),
+    "fast and alone in a world": (20.0, "worlds", math.inf),
+}
+
+
+@pytest.mark.parametrize("case", SPANS)
+def test_forces_on_a_fast_body_far_from_magnets_vary_over_a_longer_distance(case, machine, device):
+    speed, more, expected = SPANS[case]
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    warpmag.register_custom_attributes(builder)
+    for x, velocity in ((0.0, speed), (0.3, 0.0)):
+        part = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        warpmag.register_custom_attributes(part)
+        ball = part.add_body(xform=wp.transform((x, 0.0, 0.0), wp.quat_identity()))
+        part.add_shape_sphere(ball, radius=0.01)
+        warpmag.add_inducible(part, body=ball)
+        part.body_qd[ball] = (velocity, 0.0, 0.0, 0.0, 0.0, 0.0)
+        (builder.add_world if more == "worlds" else builder.add_builder)(part)
+    if more == "coil":
+        frame = wp.transform((0.0, 0.1, 0.0), wp.quat_identity())
+        warpmag.add_coil(builder, radius=0.02, wire_radius=0.001, ampere_turns=1.0, xform=frame)
+    if more == "map":
+        nodes = np.ones((3, 3, 3, 3))
+        warpmag.add_field_map(builder, origin=(0.0, 0.0, 0.0), spacing=(0.05, 0.06, 0.07), values=nodes)
+    model = builder.finalize(device=device)
+    sizes, magnets = body_sizes(model), warpmag.Magnetics(model).magnetic_shapes()
+    watched = machine.make_monitor(sizes.thickness, sizes.force_length, sizes.reach)
+    measure_force_spans(watched, view_bodies(model, model.state()), magnets, 0.01)
+    np.testing.assert_allclose(watched.force_span.numpy(), [expected, 0.01], rtol=1e-5)  # the other ball is at rest
