@@ -1,4 +1,4 @@
-"""The error at which solves of bodies of cells end: that of the magnetization in the energy norm."""
+"""Solves of iron bodies of cells end when the error of the magnetization in the energy norm is at most ``rtol``."""
 
 import math
 

@@ -9,16 +9,17 @@ residual r = g − s. With the last few changes Δs_j, Δr_j, Anderson's step is
 
 The weight φ = Ms c(a)/a, a = max(‖s‖, ‖g‖), converts a residual to magnetization, so that the large s of saturated
 moments does not dominate. The plain step is mirror descent on the energy Σ V Φ(M) − ½ M·GM − H0·M, which is convex for
-the ball-averaged kernel. Let L_i = 1 + k (2/3 + o_i), with o_i the volume that a ball shares with others
-(``total_overlap`` in ``theta_flow.h``). The energy decreases from any state for ω_i ≤ 1/L_i, and near the solution the
-steps converge for ω_i < 2/L_i. Steps are short only where balls overlap. Cells of bodies that take steps as a whole
-(``body_steps.py``) count o_i twice, because of the demagnetizing factor of overlaps.
+the ball-averaged kernel. Let L_i = 1 + k (2/3 + o_i), with o_i the volume that a ball shares with others, relative to
+its own (``total_overlap`` in ``theta_flow.h``). The energy decreases from any state for ω_i ≤ 1/L_i, and near the
+solution the steps converge for ω_i < 2/L_i. Steps are short only where balls overlap. Cells of bodies that take steps
+as a whole (``body_steps.py``) count o_i twice, because of the demagnetizing factor of overlaps.
 
 Once a solve has taken as many evaluations as changes are stored, the newest change, from the last mixture to this
 iterate, becomes that from the last mixture to s̄, if the iterate is the best so far. The coupling is symmetric, so that
 few such changes are as good as all (conjugate residuals; short-term recurrence of Wei, Bao and Liu 2022). Heaps of
-plates and bars take 26 evaluations in place of 35, and sheets on each other less than half. Mixtures are not evaluated:
-where the iterates do not improve, or r̄ hardly changes, the changes between iterates are more precise.
+plates and bars then take 26 evaluations instead of 35. Sheets that lie on each other take less than half as many.
+Mixtures are not evaluated: where the iterates do not improve, or r̄ hardly changes, the changes between iterates are
+more precise.
 
 A step changes the field most at near neighbors. Sweeps update the neighbors' part without another evaluation of the
 whole field. With the coupling G' of the listed neighbors, two sweeps s ← s + ω' (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s)
@@ -30,22 +31,22 @@ the best iterate follow, and no more sweeps: where balls overlap cells, sweeps c
 
 **Result and error.** The last residual allows one more step. A solve returns M and H of s̄ + ω₁ r̄, with M = f(H). The
 whole step ω₁ is 1, which solves an isolated ball, or less where balls overlap. The part of r that the mixture removes
-changes s by at most γ times that part, γ = max ‖φ Δs_j‖/‖φ Δr_j‖. The step corrects the rest, r̄, and the estimate
-allows the same error again. So the estimate amplifies the residual (Eq. 12) of the last iterate,
+changes s by at most γ times that part, γ = max ‖φ Δs_j‖/‖φ Δr_j‖. The step corrects the rest, r̄. The estimate counts
+r̄ as an error, weighted by λ. So the estimate amplifies the residual (Eq. 12) of the last iterate,
 
     error = ‖M − f(H)‖/‖f(H)‖ · max(1, σ [λ ‖φ r̄‖ + γ √(‖φ r‖² − ‖φ r̄‖²)]/‖φ r‖),
 
-with λ = ‖φ (2 − ω₁) r‖/‖φ r‖. The mixtures of long solves leave slow modes in r̄, so that λ is at least γ there.
+with λ = ‖φ (2 − ω₁) r‖/‖φ r‖. In long solves slow modes remain in r̄, so λ is at least γ.
 
-Inside a body of iron, closed loops of magnetization have almost no field. A residual hardly tells of them, and nothing
-outside depends on them. So in worlds with bodies of cells the error is that in the energy norm. Let a be the factor
-above, max(1, …), and b = k H0/Ms the reduced applied field:
+Inside a body of iron, closed loops of magnetization have almost no field. They barely change the residual, and do not
+affect forces or fields outside. So in worlds with bodies of cells the error is measured in the energy norm. Let A =
+max(1, …) be the amplification above, and b = k H0/Ms the reduced applied field:
 
-    error = max(‖M − f(H)‖/‖f(H)‖, ‖M − f(H)‖ √(a/⟨φ s, φ b⟩)).
+    error = max(‖M − f(H)‖/‖f(H)‖, ‖M − f(H)‖ √(A/⟨φ s, φ b⟩)).
 
-The energy norm of an error e is √⟨e, r⟩ ≤ √a ‖r‖, and ⟨s, b⟩ is the square of that of the solution. If a slow mode
-dominates the solution, as in a long bar along the field, this is the error of the magnetization. For a steel plate of
-60 × 60 × 3 mm that moves at a magnet, solves take 10 evaluations in place of 57, and forces have errors of 1e-4.
+The energy norm of an error e is √⟨e, r⟩ ≤ √A ‖r‖. The energy norm of the solution is √⟨s, b⟩. In a long bar along the
+field a slow mode dominates the solution, and both errors are equal. A steel plate of 60 × 60 × 3 mm that a magnet lifts
+takes 8 evaluations per solve; with the error of the magnetization it took 68. Its forces have errors of 1e-4.
 
 With slow convergence many steps like the last one remain. The factor σ is their geometric series ρ/(1 − ρ), and at
 least 1, with ρ the ratio of ‖φ r‖ to its smallest earlier value. At least half of σ is kept at the next evaluation. The

@@ -1,7 +1,7 @@
 """Distances over which the magnetic forces on fast bodies vary, from the gaps to all other magnets and coils.
 
-The force on a body far from other magnets varies over a longer distance than in contact. So substeps may share forces
-for longer: fragments that fly apart need no solve in each short substep.
+The force on a body far from other magnets varies over a longer distance than in contact. More substeps may then share
+forces. Fragments that fly apart do not need a solve in each pair of short substeps.
 """
 
 import warp as wp

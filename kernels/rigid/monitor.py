@@ -12,13 +12,14 @@ no plane closes. Only the tangential relative velocity of closing contacts count
 with a smaller weight: its contacts only have to be detected in time. Motion is computed from velocities, which contacts
 have limited in the last substep.
 
-**Displacement by forces** within a substep counts, too. Where contacts hold the body, the solver has to undo it, and
-the remainder heats a pile. In Sakura Tree, balls are held under 1,500 times their weight. After 0.6 s they move at
-9 cm/s with substeps of 0.5 ms, and at 2 cm/s with 0.25 ms.
+**Displacement by forces** within a substep counts, too. Where contacts hold the body, the solver has to undo this
+displacement. The part that it does not undo keeps the balls of a pile moving. In Sakura Tree contacts hold balls
+against 1,500 times their weight. After 0.6 s these balls still move at 9 cm/s with substeps of 0.5 ms, and at 2 cm/s
+with 0.25 ms.
 
 **Forces** are shared by substeps as long as bodies move little compared with the distance over which their magnetic
-forces vary. In a sheet this distance is much longer than the thickness, by which contacts judge. Far from all other
-magnets it is longer still (``force_spans``).
+forces vary. In a sheet this distance is much longer than the thickness, which limits motion in contact. Far from all
+other magnets it is longer still (``force_spans``).
 """
 
 import warp as wp
