@@ -39,7 +39,7 @@ def start(ranks: int, *command):
 
 
 def merged(done, part) -> list[int]:
-    """How often the sums of each rank were merged in a part of the program."""
+    """Return how many times each rank merged its sums in a part of the program."""
     return [int(line.split()[2]) for line in done.stderr.splitlines() if line.startswith(f"merged {part} ")]
 
 
