@@ -188,7 +188,7 @@ def run_spacings(worlds: int, device, refined: dict) -> Iterator[dict]:
 
 
 def run_phases(worlds: int, device, steps: int) -> Iterator[dict]:
-    """Yield the mean time of a step in each phase of ``steps`` steps, and the height of the plate after it.
+    """Yield means over each phase of ``steps`` steps, and the height of the plate after it.
 
     On a CPU there is one world.
     """
@@ -197,7 +197,7 @@ def run_phases(worlds: int, device, steps: int) -> Iterator[dict]:
     arm.place(PHASES["approach"][0])
     graph = None
     for phase, (first, last) in PHASES.items():
-        seconds = 0.0
+        seconds, evaluations = 0.0, np.zeros(worlds, int)
         for target in np.linspace(first, last, steps):
             arm.aim(target)
             wp.synchronize_device(arm.device)
@@ -205,7 +205,9 @@ def run_phases(worlds: int, device, steps: int) -> Iterator[dict]:
             graph = _step(arm, graph)
             wp.synchronize_device(arm.device)
             seconds += time.perf_counter() - began
+            evaluations += arm.magnetics.evaluations.numpy()
         line = {"part": "phases", "phase": phase, "worlds": worlds, "step_ms": 1e3 * seconds / steps}
+        line["mean_evaluations"] = float(evaluations.mean()) / steps
         heights = arm.heights()
         yield line | arm.times() | {"least_height": float(heights.min()), "greatest_height": float(heights.max())}
 

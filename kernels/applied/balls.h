@@ -78,8 +78,7 @@ CUDA_CALLABLE inline void add_body(const Arrays& arrays, const PermanentBody& bo
     for (int v = 0; v < VECTORS_PER_THREAD && Ball::first(v) < CHUNK; ++v) {
         const Vector x = ball.points(arrays, v);
         const Vector at = body.frame.point_to_body(x);
-        const CurlFreeField field =
-            near ? field_of(body.solid, body.m, at, least2, 0, 1) : moments_field(arrays, body, at, 0, 1);
+        const CurlFreeField field = near ? closed_form(body, at, least2, 0, 1) : moments_field(arrays, body, at, 0, 1);
         add_faded(ball.fields[v], fade, target_field(body.frame.to_world(field)));
     }
 }

@@ -68,8 +68,7 @@ CUDA_CALLABLE inline Wrench wrench_on_moments(const Arrays& arrays, const Perman
         const Real* const at = rows_at(arrays.solids.moment.data, MOMENT_ROW, tables[10] + i);
         const Vector x = q.frame.to_world(own_vector(at)) + broadcast(q.frame.origin);
         const Vector at_s = s.frame.point_to_body(x);
-        const CurlFreeField field =
-            closed ? field_of(s.solid, s.m, at_s, zero, 0, 1) : moments_field(arrays, s, at_s, 0, 1);
+        const CurlFreeField field = closed ? closed_form(s, at_s, zero, 0, 1) : moments_field(arrays, s, at_s, 0, 1);
         add_wrench(wrench, first_lanes(tables[11] - i), target_field(s.frame.to_world(field)),
                    numbers(at + 3 * CHUNK) * broadcast(q.m_world), x, center);
     }

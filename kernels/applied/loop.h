@@ -16,46 +16,62 @@
 
 namespace warpmag {
 
-// cel by Bulirsch's iteration (Bulirsch 1965), from the sums c and s after its first step.
-CUDA_CALLABLE inline double cel_after_step(double q, double p, double c, double s) {
-    double k = q, product = q, mean = 1 + q, before = 1;
-    for (int step = 0; step < 30 && fabs(before - k) > 1e-9 * before;
-         ++step) { // quadratic convergence: one more step is exact
-        k = 2 * sqrt(product);
+// A number N: double for coils, or a vector of Real for permanent bodies.
+template <class N> constexpr bool is_double = sizeof(N) <= sizeof(double) ? sizeof(N) == 8 : sizeof(Real) == 8;
+template <class N> CUDA_CALLABLE inline N number(double x) {
+    if constexpr (sizeof(N) > sizeof(double)) return N(Real(x));
+    else return N(x);
+}
+template <class N> CUDA_CALLABLE inline N square_root(N x) {
+    if constexpr (sizeof(N) > sizeof(double)) return root(x);
+    else return sqrt(x);
+}
+
+// cel by Bulirsch's iteration (Bulirsch 1965), from the sums c and s after its first step. Convergence is quadratic:
+// one more step is exact.
+template <class N> CUDA_CALLABLE inline N cel_after_step(N q, N p, N c, N s) {
+    const N tolerance = number<N>(is_double<N> ? 1e-9 : 1e-4);
+    N k = q, product = q, mean = 1 + q, before = mean * 0 + 1;
+    for (int step = 0; step < 30 && any(before > k ? before - k > tolerance * before : k - before > tolerance * before);
+         ++step) {
+        k = 2 * square_root(product);
         product = k * mean;
-        const double f = c, g = product / p;
+        const N f = c, g = product / p;
         c += s / p;
         s = 2 * (s + f * g);
         p += g;
         before = mean;
         mean += k;
     }
-    return 1.5707963267948966 * (s + c * mean) / (mean * (mean + p));
+    return number<N>(1.5707963267948966) * (s + c * mean) / (mean * (mean + p));
 }
 
-// A point near a loop of radius a about the z axis: ρ, z, α², β² and q.
-struct LoopPoint {
-    double a, rho, z, alpha2, beta2, beta, q;
+// A point near a loop of radius a about the z axis: ρ, z, α², β² and q. It counts as no nearer to the loop than the
+// root of ``least2``.
+template <class N> struct LoopPoint {
+    N a, rho, z, alpha2, beta2, beta, q;
 
-    CUDA_CALLABLE LoopPoint(double a, double rho, double z)
-        : a(a), rho(rho), z(z), alpha2(z * z + (a - rho) * (a - rho)), beta2(z * z + (a + rho) * (a + rho)),
-          beta(sqrt(beta2)), q(sqrt(alpha2) / beta) {}
+    CUDA_CALLABLE LoopPoint(N a, N rho, N z, N least2) : a(a), rho(rho), z(z) {
+        alpha2 = z * z + (a - rho) * (a - rho), beta2 = z * z + (a + rho) * (a + rho);
+        alpha2 = alpha2 > least2 ? alpha2 : least2;
+        beta = square_root(beta2), q = square_root(alpha2) / beta;
+    }
 
     // H_ρ/ρ of π ampere-turns.
-    CUDA_CALLABLE double radial() const {
-        return 4 * a * a * z / (alpha2 * beta * beta2) * cel_after_step(q, 1 + q, 1, 2 * q / (1 + q));
+    CUDA_CALLABLE N radial() const {
+        return 4 * a * a * z / (alpha2 * beta * beta2) * cel_after_step<N>(q, 1 + q, q * 0 + 1, 2 * q / (1 + q));
     }
     // H_z of π ampere-turns.
-    CUDA_CALLABLE double axial() const {
-        const double term = 4 * a * rho * rho / beta2, p = 1 + q;
-        return a / (alpha2 * beta) * cel_after_step(q, p, a * (1 + q * q) - term, 2 * q * (a * p - term / p));
+    CUDA_CALLABLE N axial() const {
+        const N term = 4 * a * rho * rho / beta2, p = 1 + q;
+        return a / (alpha2 * beta) * cel_after_step<N>(q, p, a * (1 + q * q) - term, 2 * q * (a * p - term / p));
     }
 };
 
 // Field of a thin loop of radius a about the z axis in the plane z = 0, of π ampere-turns.
 CUDA_CALLABLE inline PointField thin_loop(double a, Point x) {
     const double z = x.z, z2 = z * z, a2 = a * a, rho2 = x.x * x.x + x.y * x.y, rho = sqrt(rho2), r2 = rho2 + z2;
-    const LoopPoint at(a, rho, z);
+    const LoopPoint<double> at(a, rho, z, 0);
     const double e = at.radial(), q = at.q, p = 1 + q, ab = sqrt(at.alpha2) * at.beta;
     const double outer = 0.5 / (at.alpha2 * at.alpha2 * at.beta2 * at.beta);
     const double a4 = a2 * a2, rho4 = rho2 * rho2, z4 = z2 * z2, d2 = (rho2 - a2) * (rho2 - a2), s2 = rho2 + a2;
@@ -67,7 +83,7 @@ CUDA_CALLABLE inline PointField thin_loop(double a, Point x) {
                       * (d2 * d2 - 4 * z2 * (a2 * a4 - a4 * rho2 - a2 * rho4 + rho2 * rho4)
                          - z4 * (11 * a4 - 38 * a2 * rho2 + 11 * rho4) - 6 * z4 * z2 * s2);
     const double s1 = p1 > 0 ? n1 / (p1 + ab * q1) : (p1 - ab * q1) / rho2;
-    const double f = outer * cel_after_step(q, p, c1, 2 * q * p * s1);
+    const double f = outer * cel_after_step<double>(q, p, c1, 2 * q * p * s1);
 
     // ∂H_z/∂z
     const double p2 = 6 * a2 * (rho2 - z2) - 7 * a4 + r2 * r2, q2 = r2 - a2;
@@ -76,7 +92,7 @@ CUDA_CALLABLE inline PointField thin_loop(double a, Point x) {
                       * (-12 * a2 * a4 + a4 * (20 * rho2 - 21 * z2) - a2 * (4 * rho4 - 26 * rho2 * z2 + 6 * z4)
                          - 4 * rho2 * rho4 - 5 * rho4 * z2 + 2 * rho2 * z4 + 3 * z4 * z2);
     const double s2z = p2 > 0 && q2 > 0 ? n2 / (p2 + ab * q2) : p2 - ab * q2;
-    const double zz = outer * z * cel_after_step(q, p, c2, 2 * q * p * s2z);
+    const double zz = outer * z * cel_after_step<double>(q, p, c2, 2 * q * p * s2z);
     return axisymmetric_field(x, e, at.axial(), -e - zz, f, zz);
 }
 

@@ -167,8 +167,8 @@ CUDA_CALLABLE inline TargetField center_field(const Arrays& arrays, const Cell& 
     const bool only = arrays.only.data[arrays.coils.kind.shape[0] + b];
     TargetField f = target_field(
         only ? INVERSE_4PI * lattice_field(arrays, body, broadcast(cell.center), radius, zero == 0, share(), SHARES)
-             : body.frame.to_world(field_of(body.solid, body.m, body.frame.point_to_body(broadcast(cell.center)),
-                                            Real(0.25) * radius * radius, share(), SHARES)));
+             : body.frame.to_world(closed_form(body, body.frame.point_to_body(broadcast(cell.center)),
+                                               Real(0.25) * radius * radius, share(), SHARES)));
     f = {group_sums(f.h), group_sums(f.x), group_sums(f.y), group_sums(f.z)};
     if (!only) return f;
     auto along = [&](const auto& array) { return broadcast(real3((const Real*)array.data + 3 * (size_t)cell.moment)); };

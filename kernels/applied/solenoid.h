@@ -10,22 +10,35 @@
 
 namespace warpmag {
 
-// Field of a thin sheet of radius a from z = −b to b, of 2πb ampere-turns.
-CUDA_CALLABLE inline PointField thin_solenoid(double a, double b, Point x) {
-    const double rho = sqrt(x.x * x.x + x.y * x.y);
-    double gamma = (a - rho) / (a + rho);
-    if (fabs(gamma) < 1e-100) gamma = 1e-100; // H_z jumps at the sheet: points on it count as inside
-    const double size = fabs(gamma), sign = gamma > 0 ? 1.0 : -1.0;
-    double e = 0, hz = 0, f = 0, zz = 0;
-    for (int end = 1; end >= -1; end -= 2) {
-        const LoopPoint at(a, rho, x.z + end * b);
-        e -= end * 8 * a * a / (at.beta2 * at.beta * (1 + at.q)) * cel_after_step(at.q, 1 + at.q, 0, 1);
-        const double cel = cel_after_step(at.q, at.q / size + size, 1 + 1 / gamma, 2 * (sign + at.q / size));
-        hz += end * a / (a + rho) * (at.z / at.beta) * cel;
-        f += end * at.radial();
-        zz += end * at.axial();
+// Field of an axisymmetric source: e = H_ρ/ρ, H_z, f = (∂H_ρ/∂z)/ρ and ∂H_z/∂z.
+template <class N> struct AxisymmetricField {
+    N e, hz, f, z_z;
+};
+// Field at (ρ, z) of a thin sheet of radius a from z = −b to b, of 2πb ampere-turns: of its ends from ``begin`` on,
+// every
+// ``step``-th. Points count as no nearer to the circles at the ends than the root of ``least2``.
+template <class N>
+CUDA_CALLABLE inline AxisymmetricField<N> thin_solenoid(N a, N b, N rho, N z, N least2, int begin, int step) {
+    const N zero = a * 0, one = zero + 1, tiny = number<N>(is_double<N> ? 1e-100 : 1e-6);
+    N gamma = (a - rho) / (a + rho);
+    gamma = gamma < tiny && gamma > -tiny ? tiny : gamma; // H_z jumps at the sheet: points on it count as inside
+    const N sign = gamma > zero ? one : -one, size = sign * gamma;
+    AxisymmetricField<N> field = {zero, zero, zero, zero};
+    for (int k = begin; k < 2; k += step) {
+        const N end = one - 2 * k;
+        const LoopPoint<N> at(a, rho, z + end * b, least2);
+        const N q = at.q, p = 1 + q;
+        field.e -= end * 8 * a * a / (at.beta2 * at.beta * p) * cel_after_step<N>(q, p, zero, one);
+        const N cel = cel_after_step<N>(q, q / size + size, 1 + 1 / gamma, 2 * (sign + q / size));
+        field.hz += end * a / (a + rho) * (at.z / at.beta) * cel;
+        field.f += end * at.radial();
+        field.z_z += end * at.axial();
     }
-    return axisymmetric_field(x, e, hz, -e - zz, f, zz);
+    return field;
+}
+CUDA_CALLABLE inline PointField thin_solenoid(double a, double b, Point x) {
+    const auto field = thin_solenoid<double>(a, b, sqrt(x.x * x.x + x.y * x.y), x.z, 0, 0, 1);
+    return axisymmetric_field(x, field.e, field.hz, -field.e - field.z_z, field.f, field.z_z);
 }
 
 // Solenoid. Parameters: radius a, half-length b, and wire radius w [m]. The field of the sheet diverges at its ends;

@@ -3,13 +3,13 @@
 //
 // ``Arrays`` is the struct of sources.py. Takes INVERSE_4PI from Python.
 #pragma once
-#include "applied/polyhedron.h"
+#include "applied/axial_cylinder.h"
 #include "pairs/pair_law.h"
 
 namespace warpmag {
 
 // Numbers of a shape and of a body, as in solids.py; numbers of a moment: position and volume.
-constexpr int SHAPE_ROW = 12, SIZE_ROW = 10, MOMENT_ROW = 4;
+constexpr int SHAPE_ROW = 13, SIZE_ROW = 10, MOMENT_ROW = 4;
 
 // Origin and axes of a body in the world.
 struct Frame {
@@ -62,9 +62,10 @@ CUDA_CALLABLE inline SourceFade fade_of(Real3 point, Real unit, Real low, Real h
 
 // A permanent body. Its closed form has the magnetization ``m`` in the body's frame, and ``m_world`` in the world. If
 // the body responds to fields, this is the magnetization of a ball by the remanence alone, without the part that fields
-// induce.
+// induce. ``cylinder`` is the exact shape of a body that is magnetized along the axis of a cylinder.
 struct PermanentBody {
     Solid solid;
+    AxialCylinder cylinder;
     Frame frame;
     Real3 m, box_center, box_half, m_world;
     Real reach, far_reach, radius, label; // ``radius`` of its bounding sphere
@@ -76,6 +77,15 @@ template <class Arrays> CUDA_CALLABLE inline Real packed_at(const Arrays& arrays
 }
 template <class Arrays> CUDA_CALLABLE inline Real3 packed_real3(const Arrays& arrays, int row, int i) {
     return {packed_at(arrays, row, i), packed_at(arrays, row + 1, i), packed_at(arrays, row + 2, i)};
+}
+// The cylinder at a number of the table, of a body of magnetization m; none if m is not along its axis.
+template <class Arrays> CUDA_CALLABLE inline AxialCylinder axial_cylinder(const Arrays& arrays, int number, Real3 m) {
+    const Real* const at = arrays.solids.cylinder.data + number;
+    const Real3 axis = real3(at + 3);
+    const Real along = dot(m, axis);
+    const Real3 across = m - along * axis;
+    if (dot(across, across) > Real(1e-12) * dot(m, m)) return {};
+    return {real3(at), axis, at[6], at[7], along};
 }
 template <class Arrays> CUDA_CALLABLE inline PermanentBody body_at(const Arrays& arrays, int b) {
     const int* const row =
@@ -93,10 +103,29 @@ template <class Arrays> CUDA_CALLABLE inline PermanentBody body_at(const Arrays&
     const int first = row[1];
     const Real3 magnetized =
         row[3] ? real3((const Real*)arrays.solids.bias.data + 3 * (size_t)first) : packed_real3(arrays, 4, first);
-    const Real3 m = size[0] * magnetized;
-    return {solid, frame,   frame.to_body(m), real3(size + 4), real3(size + 7),
-            m,     size[1], size[2],          size[3],         packed_at(arrays, 7, first),
-            first, row[2],  row[0],           row[3]};
+    const Real3 m = size[0] * magnetized, local = frame.to_body(m);
+    const AxialCylinder cylinder = tables[12] < 0 ? AxialCylinder{} : axial_cylinder(arrays, tables[12], local);
+    return {solid,
+            cylinder,
+            frame,
+            local,
+            real3(size + 4),
+            real3(size + 7),
+            m,
+            size[1],
+            size[2],
+            size[3],
+            packed_at(arrays, 7, first),
+            first,
+            row[2],
+            row[0],
+            row[3]};
+}
+// Field of the closed form of a body at points in its frame.
+CUDA_CALLABLE inline CurlFreeField closed_form(const PermanentBody& body, Vector at, Number least2, int begin,
+                                               int step) {
+    if (body.cylinder.radius > 0) return field_of(body.cylinder, at, least2, begin, step);
+    return field_of(body.solid, body.m, at, least2, begin, step);
 }
 
 // Moment j of a body's lattice that the closed form replaces: only the part by the remanence if the body responds to
@@ -179,10 +208,12 @@ template <class Arrays>
 CUDA_CALLABLE inline CurlFreeField field_correction(const Arrays& arrays, const PermanentBody& body, Vector x,
                                                     Number radius, Mask mask, int begin, int step) {
     const Vector at = body.frame.point_to_body(x);
-    const Mask near = box_distance2(body, at) < body.reach * body.reach, close = mask & near, apart = mask & !near;
+    // the form of a cylinder is cheaper than its moments, everywhere
+    const Real reach = body.cylinder.radius > 0 ? body.far_reach : body.reach;
+    const Mask near = box_distance2(body, at) < reach * reach, close = mask & near, apart = mask & !near;
     CurlFreeField field = zero_field();
     if (any(close)) {
-        const CurlFreeField exact = field_of(body.solid, body.m, at, Real(0.25) * radius * radius, begin, step);
+        const CurlFreeField exact = closed_form(body, at, Real(0.25) * radius * radius, begin, step);
         add_where(close, field.h, exact.h), add_where(close, field.t, exact.t);
     }
     if (any(apart)) {
@@ -199,8 +230,9 @@ CUDA_CALLABLE inline Vector magnetization_correction(const Arrays& arrays, const
                                                      int begin, int step) {
     const Number zero = Number(Real(0));
     Vector m = {zero, zero, zero};
-    if (begin == 0)
-        add_where(inside_of(body.solid, body.frame.point_to_body(x)), m, body.frame.to_world(broadcast(body.m)));
+    const Vector at = body.frame.point_to_body(x);
+    const Mask inside = body.cylinder.radius > 0 ? points_about(body.cylinder, at).inside : inside_of(body.solid, at);
+    if (begin == 0) add_where(inside, m, body.frame.to_world(broadcast(body.m)));
     for (int j = body.first + begin; j < body.first + body.count; j += step) {
         const Vector r = x - broadcast(packed_real3(arrays, 0, j));
         const Real radius = packed_at(arrays, 3, j),

@@ -3,12 +3,15 @@
 Bodies of one shape share its tables:
 
     shape: First row and number of edges and of faces, first entry of ``begin``, first corner, first and number of
-        points on edges and on faces, first entry and number of the moments, shape [shapes, 12].
+        points on edges and on faces, first entry and number of the moments, first number in ``cylinder`` or -1, shape
+        [shapes, 13].
     edge, face, corner, begin: As in ``polyhedron.h``; flat.
     edge_point, face_point: Quadrature points on edges and faces (``warpmag.shapes.polyhedra``), in chunks of
         ``native.CHUNK`` side by side. Chunks are filled up with points of weight 0; flat.
     moment: Positions [m] and volumes [m³] of the moments that replace the closed form at a distance, in the frame of
         the body, in the same chunks; flat.
+
+    cylinder: Center, axis, radius R, and half height h [m] of the cylinder that a polyhedron replaces; flat.
 
 Each body has a row in two tables:
 
@@ -89,8 +92,10 @@ def _in_chunks(points) -> np.ndarray:
 
 def _shape_tables(solids, fine: bool):
     """Return the table ``shape`` of the shapes of ``solids``, and the other tables by name."""
-    rows, parts = [], {name: [] for name in ("edge", "face", "corner", "begin", "edge_point", "face_point", "moment")}
-    counts = np.zeros(7, int)  # edges, faces, entries of begin, corners, points on edges and on faces, moments
+    names = "edge", "face", "corner", "begin", "edge_point", "face_point", "moment", "cylinder"
+    rows, parts = [], {name: [] for name in names}
+    # edges, faces, entries of begin, corners, points on edges and on faces, moments, numbers of cylinders
+    counts = np.zeros(8, int)
     for shape, moments in ((solid.shape, solid.moments) for solid in solids):
         edges, faces = shape.edge_rows(), shape.normals
         replacing = np.c_[moments.positions, moments.volumes]
@@ -98,13 +103,15 @@ def _shape_tables(solids, fine: bool):
         on_edges, on_faces = _in_chunks(shape.edge_points()), _in_chunks(shape.face_points(fine=fine))
         in_body = _in_chunks(replacing)
         points = CHUNK * len(on_edges), CHUNK * len(on_faces), CHUNK * len(in_body)
-        start = counts.tolist()
+        exact, start = shape.cylinder, counts.tolist()
+        place = [] if exact is None else [*exact.center, *exact.axis, exact.radius, exact.half_height]
         rows.append([
             start[0], len(edges), start[1], len(faces), start[2], start[3], start[4], points[0], start[5], points[1],
-            start[6], len(replacing),
+            start[6], len(replacing), start[7] if len(place) else -1,
         ])  # fmt: skip
         corners = shape.corners[np.concatenate([np.asarray(face) for face in shape.faces])]
-        for name, part in zip(parts, (edges, faces, corners, begin, on_edges, on_faces, in_body), strict=True):
+        values = edges, faces, corners, begin, on_edges, on_faces, in_body, place
+        for name, part in zip(parts, values, strict=True):
             parts[name].append(np.asarray(part).reshape(-1))
-        counts += [len(edges), len(faces), len(begin), len(corners), *points]
+        counts += [len(edges), len(faces), len(begin), len(corners), *points, len(place)]
     return np.array(rows, np.int32), {name: np.concatenate(part) for name, part in parts.items()}

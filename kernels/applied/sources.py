@@ -93,6 +93,7 @@ def solid_arrays_type(dtype):
         edge_point: wp.array[dtype]
         face_point: wp.array[dtype]
         moment: wp.array[dtype]
+        cylinder: wp.array[dtype]
         # Bodies, shape [bodies]:
         body: wp.array2d[int]
         size: wp.array2d[dtype]

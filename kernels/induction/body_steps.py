@@ -1,4 +1,4 @@
-"""Steps of small bodies as a whole, added to the field before each step of the accelerated θ flow.
+"""Steps of bodies as a whole, added to the field before each step of the accelerated θ flow.
 
 The residual of a body's moments, r = k H/Ms − s, becomes r + w (Q − 1) r with the inverse Q of the body's own operator
 (``warpmag.shapes.body_response``). The flow then takes its usual step, and estimates the error of the body as a whole.
@@ -7,7 +7,9 @@ the body, and e that of 2 k o_i (``theta_flow.py``) beyond contact. Where Q divi
 would be right. So w = (1/λ' − 1)/(1/λ − 1) with the least λ of the body, and at least 0, exceeds the factor of no mode.
 After a step that the flow rejects, w is 0 for some solves.
 
-Sweeps leave out the pairs within such a body. Letters in contact take half as many evaluations as with sweeps alone.
+Sweeps leave out the pairs within such a body. Letters in contact take half as many evaluations as with sweeps alone, a
+plate on a magnet a quarter. The elements of Q − 1 are halves of words, the upper halves of float32: steps need no more
+digits, and reading the table takes most of the time.
 """
 
 from collections.abc import Sequence
@@ -18,74 +20,71 @@ import warp as wp
 
 from warpmag.kernels.induction.solve_state import state_type
 from warpmag.kernels.induction.theta_flow import FLOW_STEP
+from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
+from warpmag.kernels.shared.pieces import cut
+from warpmag.kernels.shared.reductions import group_threads
+from warpmag.kernels.shared.team import launch_passes, threads_for
 
+WRITE_RESIDUALS, WRITE_WEIGHTS, CHANGE_FIELD = range(3)  # the passes, in order; as in ``body_steps.h``
 _CONTACT = 0.2
 """Twice the volume over its own that a cell's ball shares with balls of bodies in contact, up to which e is 0."""
+_MEMBERS = 8
+"""Bodies with the same table that threads of a GPU compute together."""
+_FEW_THREADS = 2
+"""Threads of a GPU that share a cell of such bodies: a warp reads neighboring words of the table."""
+_PRODUCTS_PER_THREAD = 200_000
+"""Products of a tensor and a residual per thread of a CPU, at least: some 50 µs of work."""
 
 
 @cache
-def _kernels(dtype):
-    """Kernels that write the residuals of cells, and that add the change of the field by the residuals of a body."""
-    vec3, mat33, quaternion = wp.types.vector(3, dtype), wp.types.matrix((3, 3), dtype), wp.types.quaternion(dtype)
-    vec2, state_struct, ball = wp.types.vector(2, dtype), state_type(dtype), 4.0 / 3.0 * np.pi
+def _steps_type(dtype):
+    """Struct of tables, bodies, and buffers."""
+    quaternion = wp.types.quaternion(dtype)
 
-    @wp.func
-    def rests(state: state_struct, world: int) -> bool:
-        return state.worlds[world].active == 0 or state.worlds[world].apart > 0
+    @wp.struct
+    class BodyStepArrays:
+        table: wp.array[int]  # Q − 1 of all kinds of bodies, two elements a word (:func:`_packed_table`)
+        body: wp.array[wp.vec4i]  # by groups: first moment, cells or 0, index of the rotation, world
+        group: wp.array[wp.vec4i]  # members, number of cells, first entry of the table, first cell in ``residual``
+        body_chunk: wp.array[wp.vec2i]  # body and first of up to CHUNK cells
+        group_chunk: wp.array[wp.vec2i]  # group and first of up to CHUNK cells
+        gain: wp.array[dtype]  # largest eigenvalue of Q − 1 of each body
+        rotation: wp.array[quaternion]  # from the frames of bodies to the world (x, y, z, w)
+        residual: wp.array[dtype]  # residuals in the frames of the bodies, shape [cells of groups, 3, members]
+        weight: wp.array[dtype]  # w of each body
+        state: state_type(dtype)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def write_residuals(
-        cell: wp.array[wp.vec4i],
-        rotation: wp.array[quaternion],
-        state: state_struct,
-        residuals: wp.array[vec3],
-        ratios: wp.array[vec2],
-    ):
-        row = cell[wp.tid()]
-        j = row[0]
-        if rests(state, row[3]):
-            return
-        s, radius, slope, full = state.s[j], state.packed[3, j], state.slope[j], dtype(1.0)
-        residual = slope / state.saturation[j] * state.h[j] - s
-        residuals[j] = wp.quat_rotate_inv(rotation[row[1]], residual)
-        most = dtype(wp.static(ball)) * radius * radius * radius * state.saturation[j] * wp.length(s)
-        share = wp.where(most > dtype(0.0), wp.min(wp.length(state.moments[j]) / most, full), full)
-        stiffness = dtype(wp.static(2.0 * FLOW_STEP)) / state.step[j] - full
-        excess = wp.max(stiffness - slope * dtype(wp.static(2.0 / 3.0 + _CONTACT)), dtype(0.0))
-        ratios[j] = vec2(share * slope / dtype(3.0), excess)
+    return BodyStepArrays
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def add_changes(
-        cell: wp.array[wp.vec4i],
-        body: wp.array[wp.vec2i],
-        gain: wp.array[dtype],
-        table: wp.array[mat33],
-        rotation: wp.array[quaternion],
-        state: state_struct,
-        residuals: wp.array[vec3],
-        ratios: wp.array[vec2],
-    ):
-        row = cell[wp.tid()]
-        if rests(state, row[3]):
-            return
-        i, cells, response, ratio, full = row[0], body[row[1]], vec3(), vec2(), dtype(1.0)
-        for k in range(cells[1]):
-            response += table[row[2] + k] * residuals[cells[0] + k]
-            ratio += ratios[cells[0] + k]
-        largest, count = gain[row[1]], dtype(cells[1])
-        least = full + ratio[1] / count - ratio[0] / count * largest / (full + largest)
-        weight = wp.max(full / least - full, dtype(0.0)) / largest
-        state.h[i] += weight * state.saturation[i] / state.slope[i] * wp.quat_rotate(rotation[row[1]], response)
 
-    return write_residuals, add_changes
+def _packed_table(response: np.ndarray) -> np.ndarray:
+    """Return Q − 1 in words, shape [chunks of targets, pairs of sources, 9, CHUNK], from its shape [n, 3, n, 3].
+
+    The lower half of a word belongs to the first source of a pair, the upper half to the second.
+    """
+    count = len(response)
+    chunks, pairs = -(-count // CHUNK), -(-count // 2)
+    halves = np.zeros((chunks * CHUNK, 3, 2 * pairs, 3), np.uint16)
+    halves[:count, :, :count] = response
+    # chunk, lane, row, pair, half, column -> chunk, pair, row, column, lane, half
+    halves = halves.reshape(chunks, CHUNK, 3, pairs, 2, 3).transpose(0, 3, 2, 5, 1, 4)
+    return np.ascontiguousarray(halves).view(np.int32).reshape(chunks, pairs, 9, CHUNK)
+
+
+@cache
+def _kernel(dtype, members: int, group: int):
+    call = "add_body_steps(thread, first, last, threads, team.data, steps)"
+    arguments = {**PASS_ARGUMENTS, "steps": _steps_type(dtype)}
+    constants = dict(MEMBERS=members, GROUP=group, FLOW_STEP=FLOW_STEP, CONTACT=_CONTACT)
+    return native_kernel(call, "induction/body_steps.h", arguments, dtype=dtype, **constants)
 
 
 class BodySteps:
     """Steps of bodies as a whole, repeatedly in the same arrays.
 
     Args:
-        bodies: For each body its first moment, the index of its rotation, Q − 1 in its frame, shape [n, 3, n, 3], and
-            the largest eigenvalue of Q − 1. Bodies with the same array share it.
+        bodies: For each body its first moment, the index of its rotation, Q − 1 in its frame as the upper halves of
+            float32, shape [n, 3, n, 3], and the largest eigenvalue of Q − 1. Bodies with the same array share it.
         worlds: World of each body.
         rotations: Rotations from the frames of bodies to the world (x, y, z, w).
         state: State of the solve (``solve_state``), bound to its moments.
@@ -94,30 +93,55 @@ class BodySteps:
     def __init__(self, bodies: Sequence[tuple[int, int, np.ndarray, float]], worlds, rotations, state):
         """Lay out the tables on the device of the state."""
         device, dtype = state.h.device, state.packed.dtype
-        ranges, gains = np.zeros((len(rotations), 2), np.int32), np.zeros(len(rotations))
-        tables, begins, size, cells = [], {}, 0, []
-        for (first, number, response, gain), world in zip(bodies, worlds, strict=True):
-            count = len(response)
-            if id(response) not in begins:
-                begins[id(response)], size = size, size + count * count
-                tables.append(response.transpose(0, 2, 1, 3).reshape(-1, 3, 3))
-            own = np.arange(count)
-            columns = first + own, np.full(count, number), begins[id(response)] + count * own, np.full(count, world)
-            cells.append(np.stack(columns, axis=1))
-            ranges[number], gains[number] = (first, count), gain
+        kinds: dict[int, list[int]] = {}
+        for number, (_, _, response, _) in enumerate(bodies):
+            kinds.setdefault(id(response), []).append(number)
+        is_shared = device.is_cuda and len(bodies) >= _MEMBERS * len(kinds)
+        members = _MEMBERS if is_shared else 1
+        self._steps = steps = _steps_type(dtype)()
+        steps.rotation, steps.state = rotations, state
+        self._lay_out(bodies, worlds, kinds.values(), members, device)
+        group = _FEW_THREADS if is_shared else group_threads(device)
+        products = sum(len(response) ** 2 for _, _, response, _ in bodies)
+        threads, kernel = threads_for(products, _PRODUCTS_PER_THREAD), _kernel(dtype, members, group)
+        items = CHUNK * len(steps.body_chunk), len(steps.body), CHUNK * len(steps.group_chunk)
+        ranges = [(k, k) for k in range(CHANGE_FIELD + 1)] if device.is_cuda else [(WRITE_RESIDUALS, CHANGE_FIELD)]
+        self._launches = []
+        for first, last in ranges:
+            sizes = dict(device=device, threads=threads, gpu_threads=group * items[first])
+            self._launches.append(launch_passes(kernel, first, last + 1, steps, record_cmd=True, **sizes))
+
+    def _lay_out(self, bodies, worlds, kinds, members: int, device):
+        """Fill the arrays; ``kinds`` are the indices of the bodies of each table."""
+        steps, rows, gains, groups, tables, entries, first_cell = self._steps, [], [], [], [], 0, 0
+        for numbers in kinds:
+            response = bodies[numbers[0]][2]
+            count, table = len(response), _packed_table(response)
+            for begin in range(0, len(numbers), members):
+                part = numbers[begin : begin + members]
+                groups.append((len(part), count, entries, first_cell))
+                first_cell += 2 * table.shape[1]
+                rows += [(bodies[n][0], count, bodies[n][1], worlds[n]) for n in part]
+                gains += [bodies[n][3] for n in part]
+                rows += [(0, 0, 0, 0)] * (members - len(part))
+                gains += [1.0] * (members - len(part))
+            tables.append(table.reshape(-1))
+            entries += table.shape[0] * table.shape[1]
+        counts = np.array(rows)[:, 1], np.array(groups)[:, 1]
 
         def put(values, kind):
-            return wp.array(values, dtype=kind, device=device)
+            return wp.array(np.asarray(values), dtype=kind, device=device)
 
-        cell = put(np.concatenate(cells).astype(np.int32), wp.vec4i)
-        mat33 = wp.types.matrix((3, 3), dtype)
-        tables = cell, put(ranges, wp.vec2i), put(gains, dtype), put(np.concatenate(tables), mat33), rotations, state
-        buffers = wp.zeros_like(state.h), wp.zeros(len(state.h), dtype=wp.types.vector(2, dtype), device=device)
-        arguments = (cell, rotations, state, *buffers), (*tables, *buffers)
-        self._launches = [
-            wp.launch(kernel, dim=len(cell), inputs=inputs, device=device, record_cmd=True)
-            for kernel, inputs in zip(_kernels(dtype), arguments, strict=True)
-        ]
+        def chunks(count):
+            number, offset, _ = cut(np.zeros(len(count), int), count, CHUNK)
+            return put(np.stack([number, offset], axis=1).astype(np.int32), wp.vec2i)
+
+        dtype = steps.rotation.dtype._wp_scalar_type_
+        steps.table, steps.gain = put(np.concatenate(tables), wp.int32), put(gains, dtype)
+        steps.body, steps.group = (put(np.array(table, np.int32), wp.vec4i) for table in (rows, groups))
+        steps.body_chunk, steps.group_chunk = (chunks(count) for count in counts)
+        steps.residual = wp.zeros(3 * members * first_cell, dtype=dtype, device=device)
+        steps.weight = wp.zeros(len(rows), dtype=dtype, device=device)
 
     def launch(self):
         """Launch the change of the field at the moments of the bodies."""

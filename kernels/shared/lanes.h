@@ -4,7 +4,8 @@
 // ``Number``, ``Index`` and ``Mask`` hold a Real, an int and a truth value for each of ``WIDTH`` balls. ``Four`` holds
 // four numbers of each ball's cache line. On a GPU ``GROUP`` threads share a ball; Python sets ``GROUP``, a power of
 // two. Arrays have ``CHUNK`` balls along their last axis, so that a vector of balls is contiguous in memory. ``gather``
-// reads its indices from memory, ``collect`` takes them in a vector.
+// reads its indices from memory, ``collect`` takes them in a vector. ``lower_number`` and ``upper_number`` are the two
+// numbers in a word, each the upper half of a float.
 #pragma once
 
 namespace warpmag {
@@ -32,6 +33,8 @@ CUDA_CALLABLE inline Number smaller(Number a, Number b) { return a < b ? a : b; 
 CUDA_CALLABLE inline Number number_of(Index n) { return (Number)n; }
 CUDA_CALLABLE inline Index truncated(Number x) { return (int)x; }
 CUDA_CALLABLE inline Mask mask_of(bool condition) { return condition; }
+CUDA_CALLABLE inline Number lower_number(Index word) { return (Number)__int_as_float(word << 16); }
+CUDA_CALLABLE inline Number upper_number(Index word) { return (Number)__int_as_float(word & ~0xffff); }
 CUDA_CALLABLE inline Number numbers(const Real* row) { return *row; }
 CUDA_CALLABLE inline Index indices(const int* row) { return *row; }
 CUDA_CALLABLE inline void put(Real* row, Number n) { *row = n; }
@@ -102,6 +105,13 @@ inline Number smaller(Number a, Number b) { return __builtin_elementwise_min(a, 
 inline Number number_of(Index n) { return __builtin_convertvector(n, Number); }
 inline Index truncated(Number x) { return __builtin_convertvector(x, Index); }
 template <class Condition> inline Mask mask_of(Condition condition) { return __builtin_convertvector(condition, Mask); }
+inline Number number_of_bits(Index bits) {
+    float values __attribute__((ext_vector_type(WIDTH)));
+    __builtin_memcpy(&values, &bits, sizeof(values));
+    return __builtin_convertvector(values, Number);
+}
+inline Number lower_number(Index word) { return number_of_bits(word << 16); }
+inline Number upper_number(Index word) { return number_of_bits(word & ~0xffff); }
 inline Number numbers(const Real* row) {
     Number n;
     __builtin_memcpy(&n, row, sizeof(n));

@@ -4,27 +4,50 @@ import numpy as np
 
 from warpmag.kernels.induction.body_steps import BodySteps
 from warpmag.kernels.shared.copies import put_copies
+from warpmag.moments.cached_shapes import shape_cache
 from warpmag.moments.layout import MomentLayout
 from warpmag.shapes.body_response import MOST_CELLS, residual_response
+from warpmag.shapes.demagnetization import Coupling
+
+_MOST_BYTES = 1 << 27
+"""Largest size of all tables: those of 14 plates. Further kinds of bodies iterate without steps."""
 
 
 def make_body_steps(couplings, layout: MomentLayout, rotations, state, dynamics: str) -> BodySteps | None:
-    """Prepare the steps of small bodies as a whole; None without them, and for other ``dynamics`` than theta.
+    """Prepare the steps of bodies as a whole; None without them, and for other ``dynamics`` than theta.
 
     ``couplings`` are the first moment and the coupling of each body of all copies among the others of its world. The
-    moments of small bodies, and few moments in place of a body, act on each other by tensors alone from now on.
+    moments of these bodies, and few moments in place of a body, act on each other by tensors alone from now on.
     """
-    within, responses, bodies = np.ones(len(layout.radii)), {}, []
+    if dynamics != "theta":
+        return None
+    responses = _responses({id(coupling): coupling for _, coupling in couplings})
+    within, bodies = np.ones(len(layout.radii)), []
     for number, (first, coupling) in enumerate(couplings):
-        is_small = coupling.near and len(coupling.radii) <= MOST_CELLS
-        if is_small:
-            if id(coupling) not in responses:
-                responses[id(coupling)] = residual_response(coupling)
-            bodies.append((first, number, *responses[id(coupling)]))
-        if is_small or not coupling.near:
+        response = responses.get(id(coupling))
+        if response is not None:
+            bodies.append((first, number, *response))
+        if response is not None or not coupling.near:
             within[first : first + len(coupling.radii)] = 0.0  # empty beyond the first copy
     state.within_body = put_copies(within, state.within_body.dtype, state.within_body.device, layout.copies)
-    if not bodies or dynamics != "theta":
+    if not bodies:
         return None
     worlds = layout.worlds_of(np.array([first for first, *_ in bodies]))
     return BodySteps(bodies, worlds.tolist(), rotations, state)
+
+
+def _responses(couplings: dict[int, Coupling]) -> dict[int, tuple[np.ndarray, float]]:
+    """Return Q − 1 of each kind of body that has one, and its largest eigenvalue."""
+    result, size = {}, 0
+    for key, coupling in couplings.items():
+        bytes_of_table = 18 * len(coupling.radii) ** 2
+        if coupling.near and len(coupling.radii) <= MOST_CELLS and size + bytes_of_table <= _MOST_BYTES:
+            result[key], size = _response(coupling), size + bytes_of_table
+    return result
+
+
+def _response(coupling: Coupling) -> tuple[np.ndarray, float]:
+    """Return Q − 1 of a body and its largest eigenvalue, from the cache of shapes or computed."""
+    key = "response", coupling.positions, coupling.radii, coupling.start, coupling.other
+    key = (*key, coupling.grid_tensor, coupling.grid_rotation, coupling.common)
+    return shape_cache().get(f"response of {len(coupling.radii)} cells", key, lambda: residual_response(coupling))

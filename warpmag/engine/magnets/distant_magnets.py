@@ -11,7 +11,7 @@ from warpmag.declarations.magnets import MagneticSettings
 from warpmag.engine.magnets.grouping import BodyMagnet
 from warpmag.engine.magnets.model_values import ModelValues
 from warpmag.engine.magnets.placed_moments import PlacedMoments
-from warpmag.engine.magnets.sampling import BodyLattice, shape_cache
+from warpmag.engine.magnets.sampling import BodyLattice
 from warpmag.kernels.rigid.distant import (
     DistantBodies,
     DistantLaunches,
@@ -20,6 +20,7 @@ from warpmag.kernels.rigid.distant import (
 )
 from warpmag.kernels.shared.copies import put_copies
 from warpmag.moments.arrays import PersistentArray
+from warpmag.moments.cached_shapes import shape_cache
 from warpmag.moments.ranks import current_ranks
 from warpmag.moments.resting_worlds import RestingWorlds
 from warpmag.moments.system import MomentSystem

@@ -6,9 +6,9 @@ import numpy as np
 from warpmag.declarations.magnets import LINEAR_CURVE, MagneticSettings
 from warpmag.engine.magnets.equal_worlds import EqualWorlds, kinematic_bodies
 from warpmag.engine.magnets.grouping import BodyMagnet
-from warpmag.engine.magnets.sampling import shape_cache
 from warpmag.kernels.applied.solids import SolidMagnet
 from warpmag.kernels.near_contact.images import IronFaces
+from warpmag.moments.cached_shapes import shape_cache
 from warpmag.moments.layout import MomentMaterial
 from warpmag.moments.settings import SolverSettings
 from warpmag.moments.system import MomentSystem

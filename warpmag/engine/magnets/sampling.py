@@ -2,7 +2,6 @@
 
 import contextlib
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import newton
@@ -14,11 +13,11 @@ from warpmag.declarations.rotations import rotate
 from warpmag.engine.magnets.attributes import close_rows, unique_rows
 from warpmag.errors import InputError
 from warpmag.moments.arrays import RADIUS_RANGE
+from warpmag.moments.cached_shapes import shape_cache
 from warpmag.shapes import lattice, polyhedra
 from warpmag.shapes.demagnetization import Coupling, coupling
 from warpmag.shapes.flat_faces import FlatFaces, faces_of_mesh, faces_of_polyhedron, joined
 from warpmag.shapes.polyhedra import Moments, Polyhedron
-from warpmag.shapes.shape_cache import FOLDER, ShapeCache
 from warpmag.shapes.solids import boxes_meet
 from warpmag.shapes.uniform_response import with_surface_response
 
@@ -207,11 +206,6 @@ class ShapeSampler:
         centers, radii = self._frames[shapes, :3], self._scales[shapes, 0]
         distances = np.linalg.norm(centers[:, None] - centers, axis=2) + 3.0 * np.diag(radii)
         return bool((distances >= (radii[:, None] + radii) * (1.0 - 1e-5)).all())
-
-
-def shape_cache() -> ShapeCache:
-    """Return the cache of sampled shapes, beside the kernels that Warp compiled."""
-    return ShapeCache(Path(wp.config.kernel_cache_dir) / FOLDER)
 
 
 def lengths_of(kind: int, scale: Any) -> list[float]:
