@@ -141,8 +141,10 @@ template <class Steps> CUDA_CALLABLE inline void add_changes(const Steps& steps,
         const int i = body[0] + offset;
         const Number scale = numbers_or(elements(steps.state.saturation, i), count, 0)
                              / numbers_or(elements(steps.state.slope, i), count, 1) * steps.weight.data[first_body + w];
+        const Vector change = scale * to_world(rotation_of_body(steps, first_body + w), response);
         Real* const h = (Real*)elements(steps.state.h, i);
-        put_vectors(h, count, vectors(h, count) + scale * to_world(rotation_of_body(steps, first_body + w), response));
+        put_vectors(h, count, vectors(h, count) + change);
+        put_vectors((Real*)elements(steps.state.h_change, i), count, change);
     }
 }
 

@@ -16,7 +16,7 @@ from warpmag.kernels.shared.pieces import cut
 from warpmag.kernels.shared.reductions import block_max, block_sum, fence
 
 DEPTH = 5  # changes between iterates that are stored and mixed (``anderson.h``)
-COLUMNS = 9 + DEPTH + DEPTH * (DEPTH + 1) // 2  # sums over the moments of a chunk or world; as in ``theta_step.h``
+COLUMNS = 10 + DEPTH + DEPTH * (DEPTH + 1) // 2  # sums over the moments of a chunk or world; as in ``theta_step.h``
 BLOCK_CHUNK = 128  # moments in a chunk on a GPU, one per thread of a block; on a CPU a chunk has ``native.CHUNK``
 _CHUNK_SIZES = 4, 32, BLOCK_CHUNK
 """Sizes for which the blocks of a GPU are made. Blocks for whole chunks would be mostly idle in small worlds."""
@@ -74,9 +74,10 @@ def state_type(dtype):
         block_moments: int  # on a GPU the number of moments of the largest chunk, rounded up to one of few sizes
         chunk_begin: wp.array[int]  # first chunk of each world, shape [w + 1]
         near: wp.array3d[int]  # on a CPU rows of the neighbors of a chunk's moments, shape [c, CAPACITY, CHUNK]
-        near_count: wp.array[int]  # length of the longest list of each vector
+        near_count: wp.array[int]  # length of the longest list of each vector; on a GPU neighbors of a moment
         h0: wp.array[vec3]  # applied field [A/m], external and of permanent magnets, shape [n]
         h: wp.array[vec3]  # total field [A/m], shape [n]
+        h_change: wp.array[vec3]  # part of ``h`` by steps of bodies as a whole (``body_steps``), shape [n]; None without
         s: wp.array[vec3]  # dual variable [dimensionless], shape [n]
         mixed_s: wp.array[vec3]  # last mixture of iterates, shape [n]
         mixed_r: wp.array[vec3]  # its residual
@@ -134,7 +135,7 @@ def allocate(worlds, inducible, cells, dtype, device, copies: int = 1):
         "has_cells": put_copies(has_cells.astype(np.int32), wp.int32, device, copies),
         "converged": put(np.ones(world_count), wp.int32),  # worlds without inducible moments count as converged
         **zeros("near", (count if on_cpu else 0, CAPACITY, CHUNK)),
-        **zeros("near_count", count * vectors),
+        **zeros("near_count", count * vectors if on_cpu else row_count),
         **zeros("h0 h s mixed_s mixed_r best_s best_r mixed_g mixed_moment", n, vec3),
         **zeros("history_s history_r", (DEPTH, n), vec3),
         **zeros("past_field past_g", (2, n), vec3),

@@ -105,13 +105,26 @@ template <class State> CUDA_CALLABLE inline bool are_balls(const State& state, i
 // Calls visit(rows, mask) for the inducible neighbors of moments. A moment whose list overflowed has no neighbors.
 #if defined(__CUDA_ARCH__)
 template <class State, class Visit>
-CUDA_CALLABLE inline void visit_neighbors(const State& state, const Span& at, Visit visit) {
+CUDA_CALLABLE inline void visit_listed(const State& state, const Span& at, Visit visit) {
     const int* const list = state.neighbor.data + (size_t)CAPACITY * at.i;
     const int count = state.neighbor_count.data[at.i];
     for (int s = share(); s < (count > CAPACITY ? 0 : count); s += SHARES) {
         const int j = list[s], row = j - at.i + at.row;
         if (j >= at.begin && j < at.end && are_balls(state, at.i, j)) visit(&row, true);
     }
+}
+template <class State, class Visit>
+CUDA_CALLABLE inline void visit_neighbors(const State& state, const Span& at, Visit visit) {
+    if (state.near_count.data[at.row] > 0) visit_listed(state, at, visit);
+}
+
+// Counts the neighbors of a moment: the cells of most bodies have none, but long lists.
+template <class State> CUDA_CALLABLE inline void list_neighbors(State& state, const Span& at) {
+    int count = 0;
+    visit_listed(state, at, [&](const int*, Mask) { ++count; });
+    count = group_count(count);
+    if (share() == 0) state.near_count.data[at.row] = count;
+    __syncwarp(group_mask());
 }
 #else
 template <class State, class Visit> inline void visit_neighbors(const State& state, const Span& at, Visit visit) {
@@ -182,6 +195,7 @@ CUDA_CALLABLE inline Vector extrapolated_field(const State& state, const Span& a
 
 // Starts a solve: writes step lengths, and first moments from the applied field and the last solutions.
 template <class State> CUDA_CALLABLE inline void start(State& state, const Span& at) {
+    if (state.searching.data[0]) list_neighbors(state, at);
     if (state.resting.data[at.world]) return;
     auto& world = state.worlds.data[at.world];
     const int warm = state.warm.data[at.world];
@@ -267,12 +281,19 @@ template <class State, class Put> CUDA_CALLABLE inline void measure(State& state
     const Number ratio_s = material.saturation * curve_ratio(length_s, material.curves);
     const Number ratio_g = material.saturation * curve_ratio(length_g, material.curves);
     // lengths, not squares: the square of 1e-20 A/m underflows float32
-    const Wide goal = wide(induced_share(material) * ratio_g * length_g),
-               deviation = wide(length(ratio_g * g - ratio_s * s));
+    const Wide goal = wide(induced_share(material) * ratio_g * length_g);
+    const Vector changed = ratio_g * g - ratio_s * s;
+    Vector deviation = changed;
+    if (state.h_change.data != nullptr && world.apart == 0) {
+        const Vector own = g - material.slope / material.saturation * get(state.h_change, at);
+        deviation = material.saturation * curve_ratio(length(own), material.curves) * own - ratio_s * s;
+    }
+    const Wide size = wide(length(deviation));
     const Wide weight = wide(length_s > length_g ? ratio_s : ratio_g), square = weight * weight;
     const Wide merit = weight * wide(length(r));
-    put(DEVIATION, deviation * deviation);
+    put(DEVIATION, size * size);
     put(GOAL, goal * goal);
+    put(ENERGY, wide_dot(deviation, changed));
     const Number share = induced_share(material);
     put(WORK, wide(share * share) * square * wide_dot(s, material.slope / material.saturation * get(state.h0, at)));
     const Wide left = merit * wide(2 - whole_step<Real>(step_of(state, at)));
@@ -414,7 +435,6 @@ template <class State> inline void run_pass(State& state, int pass, int row) {
     if (at.count == 0) return;
     auto& world = state.worlds.data[at.world];
     if (pass == START) {
-        if (state.searching.data[0]) list_neighbors(state, at);
         start(state, at);
         if (row == CHUNK * state.chunk_begin.data[at.world]) begin_world(state, at.world);
     } else if (pass == FIRST_SWEEP || pass == LAST_SWEEP) {

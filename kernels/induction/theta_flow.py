@@ -124,7 +124,7 @@ def _begin_kernel(dtype, group: int, blocks: int):
         moments_per_block = wp.block_dim() // wp.static(group)
         begin = chunk[0] + moments_per_block * (block % wp.static(blocks)) + lane // wp.static(group)
         end = chunk[1]
-        if state.resting[chunk[2]] != 0:
+        if state.resting[chunk[2]] != 0 and state.searching[0] == 0:
             end = chunk[0]
         for row in range(begin, end, moments_per_block * wp.static(blocks)):
             start(state, row)

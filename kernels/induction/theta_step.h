@@ -14,9 +14,10 @@ constexpr double REMEMBERED = 0.5;     // fraction of the slowness that is kept 
 constexpr double DISTINCT = 0.01; // least change of the residual between mixtures, as a fraction of the last change
 constexpr double ROUNDING = 8.0 * (sizeof(Real) == 4 ? 1.2e-7 : 2.2e-16); // residual at rounding level
 
-// Sums over the moments of a chunk or a world: ‖M − f(H)‖², ‖f(H)‖², ⟨φs, φb⟩ with b the applied field, ‖φr‖², ‖φ(2 −
-// ω₁)r‖², ‖φΔs‖² of the last change and of the one before, ⟨φΔg, φΔg'⟩, ‖φΔg'‖², and the products of anderson.h.
-enum Column { DEVIATION, GOAL, WORK, MERIT, LEFT, CHANGE, FORMER, FOLLOWED, EARLIER, PRODUCTS };
+// Sums over the moments of a chunk or a world: ‖M − f(H)‖², ‖f(H)‖², ⟨M − f(H), M − f(H')⟩ with H' the field changed by
+// steps of bodies as a whole, ⟨φs, φb⟩ with b the applied field, ‖φr‖², ‖φ(2 − ω₁)r‖², ‖φΔs‖² of the last change and of
+// the one before, ⟨φΔg, φΔg'⟩, ‖φΔg'‖², and the products of anderson.h.
+enum Column { DEVIATION, GOAL, ENERGY, WORK, MERIT, LEFT, CHANGE, FORMER, FOLLOWED, EARLIER, PRODUCTS };
 constexpr int COLUMNS = PRODUCTS + DEPTH + DEPTH * (DEPTH + 1) / 2; // as in solve_state.py
 
 // Convergent step length ω = κ/k of a moment with stiffness k (2/3 + o_i), in scalars S.
@@ -126,7 +127,7 @@ CUDA_CALLABLE inline double amplification(const World& world, const double* sums
 // Error of a solution whose residual is amplified by a factor: of the magnetization, or with cells in the energy norm.
 CUDA_CALLABLE inline double solution_error(bool has_cells, const double* sums, double residual, double factor) {
     if (!has_cells || !(sums[WORK] > 0.0)) return factor * residual;
-    const double energy = wp::sqrt(factor * sums[DEVIATION] / sums[WORK]);
+    const double energy = sums[ENERGY] > 0.0 ? wp::sqrt(factor * sums[ENERGY] / sums[WORK]) : 0.0;
     return energy > residual ? energy : residual;
 }
 

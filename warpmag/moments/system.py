@@ -112,8 +112,7 @@ class MomentSystem:
         error: Relative error of each world's magnetization, estimated by ``theta`` (see ``kernels.induction``); other
             dynamics give the residual; shape [worlds].
         residual: Relative residual ‖M − f(H)‖/‖f(H)‖ of each world at its last field evaluation, the computable form of
-            Eq. 12, shape [worlds]; ``theta`` takes one more step after it. Bodies that take steps as a whole
-            (``kernels.induction.body_steps``) have the deviation from such a step in it.
+            Eq. 12, shape [worlds]; ``theta`` takes one more step after it.
         evaluations: Field evaluations of the last solve, shape [worlds].
         converged: 1 where the last solve reached ``rtol``, shape [worlds].
     """
