@@ -16,21 +16,40 @@
 
 namespace warpmag {
 
-// cel by Bulirsch's iteration (Bulirsch 1965), from the sums c and s after its first step.
-CUDA_CALLABLE inline double cel_after_step(double q, double p, double c, double s) {
-    double k = q, product = q, mean = 1 + q, before = 1;
-    for (int step = 0; step < 30 && fabs(before - k) > 1e-9 * before;
-         ++step) { // quadratic convergence: one more step is exact
-        k = 2 * sqrt(product);
-        product = k * mean;
-        const double f = c, g = product / p;
-        c += s / p;
-        s = 2 * (s + f * g);
-        p += g;
-        before = mean;
-        mean += k;
+// factor × cel(q, p, c, s), with p and the sums c and s after the first step of the iteration.
+struct Cel {
+    double factor, p, c, s;
+};
+
+// Writes the values of N integrals for each of M values of q, by Bulirsch's iteration (Bulirsch 1965). The integrals of
+// one q share the arithmetic-geometric mean of 1 and q. The loop contains all integrals, because each square root and
+// division takes long, and independent ones overlap.
+template <int M, int N>
+CUDA_CALLABLE inline void evaluate(const double (&q)[M], const Cel (&cel)[M][N], double (&values)[M][N]) {
+    double p[M][N], c[M][N], s[M][N], k[M], product[M], mean[M], apart = 0;
+    for (int m = 0; m < M; ++m) {
+        k[m] = product[m] = q[m], mean[m] = 1 + q[m], apart += fabs(1 - q[m]);
+        for (int n = 0; n < N; ++n) p[m][n] = cel[m][n].p, c[m][n] = cel[m][n].c, s[m][n] = cel[m][n].s;
     }
-    return 1.5707963267948966 * (s + c * mean) / (mean * (mean + p));
+    for (int step = 0; step < 30 && apart > 1e-9; ++step) { // quadratic convergence: one more step is exact
+        apart = 0;
+        for (int m = 0; m < M; ++m) {
+            k[m] = 2 * sqrt(product[m]);
+            product[m] = k[m] * mean[m];
+            for (int n = 0; n < N; ++n) {
+                const double f = c[m][n], inverse = 1 / p[m][n], g = product[m] * inverse;
+                c[m][n] += s[m][n] * inverse;
+                s[m][n] = 2 * (s[m][n] + f * g);
+                p[m][n] += g;
+            }
+            apart += fabs(mean[m] - k[m]) / mean[m];
+            mean[m] += k[m];
+        }
+    }
+    for (int m = 0; m < M; ++m)
+        for (int n = 0; n < N; ++n)
+            values[m][n] = 1.5707963267948966 * cel[m][n].factor * (s[m][n] + c[m][n] * mean[m])
+                           / (mean[m] * (mean[m] + p[m][n]));
 }
 
 // A point near a loop of radius a about the z axis: ρ, z, α², β² and q.
@@ -42,13 +61,13 @@ struct LoopPoint {
           beta(sqrt(beta2)), q(sqrt(alpha2) / beta) {}
 
     // H_ρ/ρ of π ampere-turns.
-    CUDA_CALLABLE double radial() const {
-        return 4 * a * a * z / (alpha2 * beta * beta2) * cel_after_step(q, 1 + q, 1, 2 * q / (1 + q));
+    CUDA_CALLABLE Cel radial() const {
+        return {4 * a * a * z / (alpha2 * beta * beta2), 1 + q, 1, 2 * q / (1 + q)};
     }
     // H_z of π ampere-turns.
-    CUDA_CALLABLE double axial() const {
+    CUDA_CALLABLE Cel axial() const {
         const double term = 4 * a * rho * rho / beta2, p = 1 + q;
-        return a / (alpha2 * beta) * cel_after_step(q, p, a * (1 + q * q) - term, 2 * q * (a * p - term / p));
+        return {a / (alpha2 * beta), p, a * (1 + q * q) - term, 2 * q * (a * p - term / p)};
     }
 };
 
@@ -56,7 +75,7 @@ struct LoopPoint {
 CUDA_CALLABLE inline PointField thin_loop(double a, Point x) {
     const double z = x.z, z2 = z * z, a2 = a * a, rho2 = x.x * x.x + x.y * x.y, rho = sqrt(rho2), r2 = rho2 + z2;
     const LoopPoint at(a, rho, z);
-    const double e = at.radial(), q = at.q, p = 1 + q, ab = sqrt(at.alpha2) * at.beta;
+    const double q = at.q, p = 1 + q, ab = sqrt(at.alpha2) * at.beta;
     const double outer = 0.5 / (at.alpha2 * at.alpha2 * at.beta2 * at.beta);
     const double a4 = a2 * a2, rho4 = rho2 * rho2, z4 = z2 * z2, d2 = (rho2 - a2) * (rho2 - a2), s2 = rho2 + a2;
 
@@ -67,7 +86,6 @@ CUDA_CALLABLE inline PointField thin_loop(double a, Point x) {
                       * (d2 * d2 - 4 * z2 * (a2 * a4 - a4 * rho2 - a2 * rho4 + rho2 * rho4)
                          - z4 * (11 * a4 - 38 * a2 * rho2 + 11 * rho4) - 6 * z4 * z2 * s2);
     const double s1 = p1 > 0 ? n1 / (p1 + ab * q1) : (p1 - ab * q1) / rho2;
-    const double f = outer * cel_after_step(q, p, c1, 2 * q * p * s1);
 
     // ∂H_z/∂z
     const double p2 = 6 * a2 * (rho2 - z2) - 7 * a4 + r2 * r2, q2 = r2 - a2;
@@ -76,8 +94,14 @@ CUDA_CALLABLE inline PointField thin_loop(double a, Point x) {
                       * (-12 * a2 * a4 + a4 * (20 * rho2 - 21 * z2) - a2 * (4 * rho4 - 26 * rho2 * z2 + 6 * z4)
                          - 4 * rho2 * rho4 - 5 * rho4 * z2 + 2 * rho2 * z4 + 3 * z4 * z2);
     const double s2z = p2 > 0 && q2 > 0 ? n2 / (p2 + ab * q2) : p2 - ab * q2;
-    const double zz = outer * z * cel_after_step(q, p, c2, 2 * q * p * s2z);
-    return axisymmetric_field(x, e, at.axial(), -e - zz, f, zz);
+
+    const Cel integrals[][4] = {
+        {at.radial(), at.axial(), {outer, p, c1, 2 * q * p * s1}, {outer * z, p, c2, 2 * q * p * s2z}}};
+    const double of_q[] = {q};
+    double values[1][4];
+    evaluate(of_q, integrals, values);
+    const double e = values[0][0], hz = values[0][1], f = values[0][2], zz = values[0][3];
+    return axisymmetric_field(x, e, hz, -e - zz, f, zz);
 }
 
 // Returns true if x is less than w away from the circle of radius a about the z axis at ``height``. In that case writes

@@ -16,15 +16,20 @@ CUDA_CALLABLE inline PointField thin_solenoid(double a, double b, Point x) {
     double gamma = (a - rho) / (a + rho);
     if (fabs(gamma) < 1e-100) gamma = 1e-100; // H_z jumps at the sheet: points on it count as inside
     const double size = fabs(gamma), sign = gamma > 0 ? 1.0 : -1.0;
-    double e = 0, hz = 0, f = 0, zz = 0;
-    for (int end = 1; end >= -1; end -= 2) {
-        const LoopPoint at(a, rho, x.z + end * b);
-        e -= end * 8 * a * a / (at.beta2 * at.beta * (1 + at.q)) * cel_after_step(at.q, 1 + at.q, 0, 1);
-        const double cel = cel_after_step(at.q, at.q / size + size, 1 + 1 / gamma, 2 * (sign + at.q / size));
-        hz += end * a / (a + rho) * (at.z / at.beta) * cel;
-        f += end * at.radial();
-        zz += end * at.axial();
-    }
+    const LoopPoint upper(a, rho, x.z + b), lower(a, rho, x.z - b);
+    const auto across = [&](const LoopPoint& at) -> Cel { // H_ρ/ρ
+        return {-8 * a * a / (at.beta2 * at.beta * (1 + at.q)), 1 + at.q, 0, 1};
+    };
+    const auto along = [&](const LoopPoint& at) -> Cel { // H_z
+        return {a / (a + rho) * (at.z / at.beta), at.q / size + size, 1 + 1 / gamma, 2 * (sign + at.q / size)};
+    };
+    const Cel integrals[][4] = {{across(upper), along(upper), upper.radial(), upper.axial()},
+                                {across(lower), along(lower), lower.radial(), lower.axial()}};
+    const double q[] = {upper.q, lower.q};
+    double values[2][4];
+    evaluate(q, integrals, values);
+    const auto difference = [&](int n) { return values[0][n] - values[1][n]; };
+    const double e = difference(0), hz = difference(1), f = difference(2), zz = difference(3);
     return axisymmetric_field(x, e, hz, -e - zz, f, zz);
 }
 
