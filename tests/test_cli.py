@@ -121,6 +121,14 @@ def test_an_existing_result_is_not_overwritten(scene, device, tmp_path, capsys):
     assert Usd.Stage.Open(str(out)).GetEndTimeCode() == pytest.approx(1.0, abs=0.03)  # at the nearest step
 
 
+@pytest.mark.parametrize("name", ["x" * 260, f"{'x' * 300}/out"], ids=["file", "folder"])
+def test_an_output_whose_name_is_too_long_is_refused_in_one_line(name, scene, device, tmp_path, capsys):
+    out = tmp_path / f"{name}.usda"
+    assert cli.main(["run", str(scene), "-o", str(out), "--frames", "1", "--device", device]) == cli.BAD_INPUT
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"warpmag: {out}: ")
+
+
 def test_step_duration_and_field_reach_the_simulation(scene, tmp_path, monkeypatch):
     """A field that begins with a minus and has an exponent is no option."""
     loaded = {}

@@ -183,6 +183,37 @@ def test_contacts_at_the_end_of_a_step_serve_the_next_one(device, monkeypatch):
     assert len(searches) == 11
 
 
+def test_a_repeated_step_starts_from_the_magnetizations_at_its_begin(device, monkeypatch):
+    """Those of the rejected attempt belong to other poses: a repeated first solve took 6 evaluations, not 3."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    warpmag.register_attributes(builder)
+    for number in range(12):
+        add_ball(builder, (0.0, 0.0, 2.02 * R * number))
+    simulation = Simulation(builder, device=device, external_field=(0.0, 0.0, 8e4), graphs=False)
+    system, starts, evaluations = simulation.magnetics.system, [], []
+    induce = warpmag.Magnetics.induce
+
+    def record(magnetics, *arguments, **options):
+        starts.append([array.numpy().copy() for array in system.start_arrays()])
+        induce(magnetics, *arguments, **options)
+        evaluations.append(int(system.evaluations.numpy()[0]))
+
+    monkeypatch.setattr(warpmag.Magnetics, "induce", record)
+    for speeds in (np.zeros(12), np.linspace(-40.0, 40.0, 12)):  # with a cold start, and with a warm one
+        velocities = simulation.state.body_qd.numpy()
+        velocities[:, 0] = speeds
+        simulation.state.body_qd.assign(velocities)
+        starts.clear()
+        evaluations.clear()
+        before = simulation.statistics.repeated
+        simulation.step()
+        assert simulation.statistics.repeated > before
+        dual, warm, _ = starts[0]
+        repeated = next(k for k, start in enumerate(starts) if k and np.array_equal(start[0], dual))
+        assert starts[repeated][1] == min(warm, 1)  # nothing is extrapolated
+        assert evaluations[repeated] <= max(evaluations[0], 3)
+
+
 def test_a_state_may_be_changed_between_steps(device):
     """Poses and velocities that a user sets count, in contacts too: as in a simulation that came there."""
     first, second = (Simulation(pile(), device=device) for _ in range(2))

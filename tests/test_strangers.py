@@ -4,6 +4,7 @@ import http.server
 import itertools
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -238,6 +239,21 @@ def test_a_path_behind_links_that_cannot_be_read_is_no_file(monkeypatch):
 
     monkeypatch.setattr(os.path, "realpath", realpath)
     assert "is not a regular file" in irregular_file("scene.usda")
+
+
+@pytest.mark.parametrize("kind", ["pipe", "socket"])
+def test_a_pipe_or_socket_without_a_name_is_no_file(kind, tmp_path):
+    """``/dev/stdin`` leads to one in a pipeline; it waited there for a key, as the value of a shader of type string."""
+    ends = os.pipe() if kind == "pipe" else [end.detach() for end in socket.socketpair()]
+    try:
+        name = f"/proc/self/fd/{ends[0]}"
+        (tmp_path / "link.png").symlink_to(name)
+        for path in (name, f"/dev/fd/{ends[0]}", tmp_path / "link.png"):
+            assert irregular_file(path) == f"{path} is not a regular file"
+    finally:
+        for end in ends:
+            os.close(end)
+    assert irregular_file(name) == ""  # a missing file, which USD reports
 
 
 @pytest.mark.parametrize("kind", IRREGULAR)

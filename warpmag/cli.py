@@ -318,7 +318,7 @@ def _check_run(options) -> None:
 
 def _check_new(output: Path) -> None:
     """Raise :class:`InputError` if the output exists."""
-    if output.exists():
+    if os.path.exists(output):  # a name that is too long is an error of the writer; Path.exists() raises OSError
         raise InputError(
             f"{output}: exists; add --overwrite to replace it, --resume to continue its run, or another -o"
         )

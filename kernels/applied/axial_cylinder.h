@@ -32,13 +32,23 @@ CUDA_CALLABLE inline CurlFreeField field_of(const AxialCylinder& cylinder, Vecto
     const Vector axis = broadcast(cylinder.axis);
     const CylinderPoints at = points_about(cylinder, x);
     const Number tiny = Real(1e-12) * a * a;
-    const auto field = thin_solenoid<Number>(a, b, root(at.rho2), at.z, larger(least2, tiny), begin, step);
+    Number e = zero, h_z = zero, f = zero, z_z = zero; // as in solenoid.h
+    for (int k = begin; k < 2; k += step) {
+        const Real sign = Real(1 - 2 * k);
+        const SheetEnd<Number> end(a, root(at.rho2), at.z + sign * b, larger(least2, tiny));
+        const Number q[] = {end.q};
+        Cel<Number> integrals[1][4];
+        for (int n = 0; n < 4; ++n) integrals[0][n] = end.integrals[n];
+        Number values[1][4];
+        evaluate<Number>(q, integrals, values);
+        e += sign * values[0][0], h_z += sign * values[0][1], f += sign * values[0][2], z_z += sign * values[0][3];
+    }
     CurlFreeField result = zero_field();
-    result.h = field.e * at.out + field.hz * axis;
-    const Number radial = at.rho2 > tiny ? (-2 * field.e - field.z_z) / at.rho2 : zero;
-    add_product(result.t, radial, at.out, at.out), add_product(result.t, field.z_z - field.e, axis, axis);
-    add_product(result.t, field.f, at.out, axis), add_product(result.t, field.f, axis, at.out);
-    result.t.xx += field.e, result.t.yy += field.e, result.t.zz += field.e;
+    result.h = e * at.out + h_z * axis;
+    const Number radial = at.rho2 > tiny ? (-2 * e - z_z) / at.rho2 : zero;
+    add_product(result.t, radial, at.out, at.out), add_product(result.t, z_z - e, axis, axis);
+    add_product(result.t, f, at.out, axis), add_product(result.t, f, axis, at.out);
+    result.t.xx += e, result.t.yy += e, result.t.zz += e;
     result = Real(INVERSE_PI) * cylinder.magnetization * result;
     if (begin == 0) add_where(at.inside, result.h, -(zero + cylinder.magnetization) * axis);
     return result;

@@ -26,24 +26,43 @@ template <class N> CUDA_CALLABLE inline N square_root(N x) {
     if constexpr (sizeof(N) > sizeof(double)) return root(x);
     else return sqrt(x);
 }
+template <class N> CUDA_CALLABLE inline N magnitude(N x) { return x < 0 ? -x : x; }
 
-// cel by Bulirsch's iteration (Bulirsch 1965), from the sums c and s after its first step. Convergence is quadratic:
-// one more step is exact.
-template <class N> CUDA_CALLABLE inline N cel_after_step(N q, N p, N c, N s) {
-    const N tolerance = number<N>(is_double<N> ? 1e-9 : 1e-4);
-    N k = q, product = q, mean = 1 + q, before = mean * 0 + 1;
-    for (int step = 0; step < 30 && any(before > k ? before - k > tolerance * before : k - before > tolerance * before);
-         ++step) {
-        k = 2 * square_root(product);
-        product = k * mean;
-        const N f = c, g = product / p;
-        c += s / p;
-        s = 2 * (s + f * g);
-        p += g;
-        before = mean;
-        mean += k;
+// factor × cel(q, p, c, s), with p and the sums c and s after the first step of the iteration.
+template <class N> struct Cel {
+    N factor, p, c, s;
+};
+
+// Writes the values of K integrals for each of M values of q, by Bulirsch's iteration (Bulirsch 1965). The integrals of
+// one q share the arithmetic-geometric mean of 1 and q. The loop contains all integrals, because each square root and
+// division takes long, and independent ones overlap.
+template <class N, int M, int K>
+CUDA_CALLABLE inline void evaluate(const N (&q)[M], const Cel<N> (&cel)[M][K], N (&values)[M][K]) {
+    const N tolerance = number<N>(is_double<N> ? 1e-9 : 1e-4); // quadratic convergence: one more step is exact
+    N p[M][K], c[M][K], s[M][K], k[M], product[M], mean[M], apart = 0 * q[0];
+    for (int m = 0; m < M; ++m) {
+        k[m] = product[m] = q[m], mean[m] = 1 + q[m], apart += magnitude(1 - q[m]);
+        for (int n = 0; n < K; ++n) p[m][n] = cel[m][n].p, c[m][n] = cel[m][n].c, s[m][n] = cel[m][n].s;
     }
-    return number<N>(1.5707963267948966) * (s + c * mean) / (mean * (mean + p));
+    for (int step = 0; step < 30 && any(mask_of(apart > tolerance)); ++step) {
+        apart = 0 * apart;
+        for (int m = 0; m < M; ++m) {
+            k[m] = 2 * square_root(product[m]);
+            product[m] = k[m] * mean[m];
+            for (int n = 0; n < K; ++n) {
+                const N f = c[m][n], inverse = 1 / p[m][n], g = product[m] * inverse;
+                c[m][n] += s[m][n] * inverse;
+                s[m][n] = 2 * (s[m][n] + f * g);
+                p[m][n] += g;
+            }
+            apart += magnitude(mean[m] - k[m]) / mean[m];
+            mean[m] += k[m];
+        }
+    }
+    for (int m = 0; m < M; ++m)
+        for (int n = 0; n < K; ++n)
+            values[m][n] = number<N>(1.5707963267948966) * cel[m][n].factor * (s[m][n] + c[m][n] * mean[m])
+                           / (mean[m] * (mean[m] + p[m][n]));
 }
 
 // A point near a loop of radius a about the z axis: ρ, z, α², β² and q. It counts as no nearer to the loop than the
@@ -58,13 +77,13 @@ template <class N> struct LoopPoint {
     }
 
     // H_ρ/ρ of π ampere-turns.
-    CUDA_CALLABLE N radial() const {
-        return 4 * a * a * z / (alpha2 * beta * beta2) * cel_after_step<N>(q, 1 + q, q * 0 + 1, 2 * q / (1 + q));
+    CUDA_CALLABLE Cel<N> radial() const {
+        return {4 * a * a * z / (alpha2 * beta * beta2), 1 + q, 0 * q + 1, 2 * q / (1 + q)};
     }
     // H_z of π ampere-turns.
-    CUDA_CALLABLE N axial() const {
+    CUDA_CALLABLE Cel<N> axial() const {
         const N term = 4 * a * rho * rho / beta2, p = 1 + q;
-        return a / (alpha2 * beta) * cel_after_step<N>(q, p, a * (1 + q * q) - term, 2 * q * (a * p - term / p));
+        return {a / (alpha2 * beta), p, a * (1 + q * q) - term, 2 * q * (a * p - term / p)};
     }
 };
 
@@ -72,7 +91,7 @@ template <class N> struct LoopPoint {
 CUDA_CALLABLE inline PointField thin_loop(double a, Point x) {
     const double z = x.z, z2 = z * z, a2 = a * a, rho2 = x.x * x.x + x.y * x.y, rho = sqrt(rho2), r2 = rho2 + z2;
     const LoopPoint<double> at(a, rho, z, 0);
-    const double e = at.radial(), q = at.q, p = 1 + q, ab = sqrt(at.alpha2) * at.beta;
+    const double q = at.q, p = 1 + q, ab = sqrt(at.alpha2) * at.beta;
     const double outer = 0.5 / (at.alpha2 * at.alpha2 * at.beta2 * at.beta);
     const double a4 = a2 * a2, rho4 = rho2 * rho2, z4 = z2 * z2, d2 = (rho2 - a2) * (rho2 - a2), s2 = rho2 + a2;
 
@@ -83,7 +102,6 @@ CUDA_CALLABLE inline PointField thin_loop(double a, Point x) {
                       * (d2 * d2 - 4 * z2 * (a2 * a4 - a4 * rho2 - a2 * rho4 + rho2 * rho4)
                          - z4 * (11 * a4 - 38 * a2 * rho2 + 11 * rho4) - 6 * z4 * z2 * s2);
     const double s1 = p1 > 0 ? n1 / (p1 + ab * q1) : (p1 - ab * q1) / rho2;
-    const double f = outer * cel_after_step<double>(q, p, c1, 2 * q * p * s1);
 
     // ∂H_z/∂z
     const double p2 = 6 * a2 * (rho2 - z2) - 7 * a4 + r2 * r2, q2 = r2 - a2;
@@ -92,8 +110,14 @@ CUDA_CALLABLE inline PointField thin_loop(double a, Point x) {
                       * (-12 * a2 * a4 + a4 * (20 * rho2 - 21 * z2) - a2 * (4 * rho4 - 26 * rho2 * z2 + 6 * z4)
                          - 4 * rho2 * rho4 - 5 * rho4 * z2 + 2 * rho2 * z4 + 3 * z4 * z2);
     const double s2z = p2 > 0 && q2 > 0 ? n2 / (p2 + ab * q2) : p2 - ab * q2;
-    const double zz = outer * z * cel_after_step<double>(q, p, c2, 2 * q * p * s2z);
-    return axisymmetric_field(x, e, at.axial(), -e - zz, f, zz);
+
+    const Cel<double> integrals[][4] = {
+        {at.radial(), at.axial(), {outer, p, c1, 2 * q * p * s1}, {outer * z, p, c2, 2 * q * p * s2z}}};
+    const double of_q[] = {q};
+    double values[1][4];
+    evaluate<double>(of_q, integrals, values);
+    const double e = values[0][0], hz = values[0][1], f = values[0][2], zz = values[0][3];
+    return axisymmetric_field(x, e, hz, -e - zz, f, zz);
 }
 
 // Returns true if x is less than w away from the circle of radius a about the z axis at ``height``. In that case writes

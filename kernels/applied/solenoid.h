@@ -10,35 +10,36 @@
 
 namespace warpmag {
 
-// Field of an axisymmetric source: e = H_ρ/ρ, H_z, f = (∂H_ρ/∂z)/ρ and ∂H_z/∂z.
-template <class N> struct AxisymmetricField {
-    N e, hz, f, z_z;
-};
-// Field at (ρ, z) of a thin sheet of radius a from z = −b to b, of 2πb ampere-turns: of its ends from ``begin`` on,
-// every
-// ``step``-th. Points count as no nearer to the circles at the ends than the root of ``least2``.
-template <class N>
-CUDA_CALLABLE inline AxisymmetricField<N> thin_solenoid(N a, N b, N rho, N z, N least2, int begin, int step) {
-    const N zero = a * 0, one = zero + 1, tiny = number<N>(is_double<N> ? 1e-100 : 1e-6);
-    N gamma = (a - rho) / (a + rho);
-    gamma = gamma < tiny && gamma > -tiny ? tiny : gamma; // H_z jumps at the sheet: points on it count as inside
-    const N sign = gamma > zero ? one : -one, size = sign * gamma;
-    AxisymmetricField<N> field = {zero, zero, zero, zero};
-    for (int k = begin; k < 2; k += step) {
-        const N end = one - 2 * k;
-        const LoopPoint<N> at(a, rho, z + end * b, least2);
-        const N q = at.q, p = 1 + q;
-        field.e -= end * 8 * a * a / (at.beta2 * at.beta * p) * cel_after_step<N>(q, p, zero, one);
-        const N cel = cel_after_step<N>(q, q / size + size, 1 + 1 / gamma, 2 * (sign + q / size));
-        field.hz += end * a / (a + rho) * (at.z / at.beta) * cel;
-        field.f += end * at.radial();
-        field.z_z += end * at.axial();
+// Integrals of one end of a thin sheet of current of radius a, at the height z above that end: H_ρ/ρ, H_z, (∂H_ρ/∂z)/ρ
+// and ∂H_z/∂z of 2πb ampere-turns are those of the upper end less those of the lower end.
+template <class N> struct SheetEnd {
+    N q;
+    Cel<N> integrals[4];
+
+    CUDA_CALLABLE SheetEnd(N a, N rho, N z, N least2) {
+        const N one = 0 * a + 1, tiny = number<N>(is_double<N> ? 1e-100 : 1e-6);
+        N gamma = (a - rho) / (a + rho);
+        gamma = magnitude(gamma) < tiny ? tiny : gamma; // H_z jumps at the sheet: points on it count as inside
+        const N size = magnitude(gamma), sign = gamma > 0 ? one : -one;
+        const LoopPoint<N> at(a, rho, z, least2);
+        q = at.q;
+        integrals[0] = {-8 * a * a / (at.beta2 * at.beta * (1 + q)), 1 + q, 0 * a, one};
+        integrals[1] = {a / (a + rho) * (at.z / at.beta), q / size + size, 1 + 1 / gamma, 2 * (sign + q / size)};
+        integrals[2] = at.radial(), integrals[3] = at.axial();
     }
-    return field;
-}
+};
+// Field of a thin sheet of radius a from z = −b to b, of 2πb ampere-turns.
 CUDA_CALLABLE inline PointField thin_solenoid(double a, double b, Point x) {
-    const auto field = thin_solenoid<double>(a, b, sqrt(x.x * x.x + x.y * x.y), x.z, 0, 0, 1);
-    return axisymmetric_field(x, field.e, field.hz, -field.e - field.z_z, field.f, field.z_z);
+    const double rho = sqrt(x.x * x.x + x.y * x.y);
+    const SheetEnd<double> upper(a, rho, x.z + b, 0), lower(a, rho, x.z - b, 0);
+    const double q[] = {upper.q, lower.q};
+    Cel<double> integrals[2][4];
+    for (int n = 0; n < 4; ++n) integrals[0][n] = upper.integrals[n], integrals[1][n] = lower.integrals[n];
+    double values[2][4];
+    evaluate<double>(q, integrals, values);
+    const auto difference = [&](int n) { return values[0][n] - values[1][n]; };
+    const double e = difference(0), hz = difference(1), f = difference(2), zz = difference(3);
+    return axisymmetric_field(x, e, hz, -e - zz, f, zz);
 }
 
 // Solenoid. Parameters: radius a, half-length b, and wire radius w [m]. The field of the sheet diverges at its ends;

@@ -177,6 +177,11 @@ def persistent_arrays(state) -> dict:
     return {name: getattr(state, name) for name in names.split()}
 
 
+def start_arrays(state) -> list:
+    """Return the arrays from which a solve starts without extrapolation."""
+    return [state.s, state.warm, state.worlds]
+
+
 def bind(state, packed, material, moments, rtol: float, max_evaluations: int) -> None:
     """Set the moments of a solve with their materials, and the limits at which it ends."""
     state.packed, state.moments, state.searching = packed.packed, moments, packed.searching
@@ -203,6 +208,24 @@ def launch_start_cold(state, chosen):
     """Discard the last solutions of worlds where ``chosen`` is not 0, shape [w]: their next solve starts cold."""
     kernel = _cold_kernel(state.packed.dtype)
     wp.launch(kernel, dim=len(chosen), inputs=[chosen, state], device=chosen.device)
+
+
+@cache
+def _restart_kernel(dtype):
+    @wp.kernel(module="unique", enable_backward=False)
+    def restart(rejected: wp.array[int], state: state_type(dtype)):
+        w = wp.tid()
+        if rejected[0] != 0:
+            state.warm[w] = wp.min(state.warm[w], 1)
+            state.worlds[w].change_count = 0
+
+    return restart
+
+
+def launch_restart(state, rejected):
+    """Discard what solves remember of the last ones except for :func:`start_arrays`, if ``rejected`` [1] is not 0."""
+    kernel = _restart_kernel(state.packed.dtype)
+    wp.launch(kernel, dim=len(state.warm), inputs=[rejected, state], device=rejected.device)
 
 
 @wp.func

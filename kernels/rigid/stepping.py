@@ -271,6 +271,7 @@ class StepMachine:
     Attributes:
         arrays: Arrays and limits.
         attempting: Condition that the step must be attempted (again).
+        rejected: Condition that the last attempt was rejected.
         forces_due: Condition that the next substeps need new forces.
         contacts_due: Condition that the contacts are not those of the present state.
         sharing: Number of substeps that share forces, shape [1].
@@ -291,7 +292,7 @@ class StepMachine:
         a.capacities = zeros(capacities, wp.int32)
         for name, limit in limits.items():
             setattr(a, name, limit)
-        self.attempting, _, self.forces_due, self.contacts_due, *self.remaining = (
+        self.attempting, self.rejected, self.forces_due, self.contacts_due, *self.remaining = (
             a.flags[k : k + 1] for k in range(FLAGS)
         )
         self.sharing = a.status[STATUS_SHARING : STATUS_SHARING + 1]

@@ -365,6 +365,14 @@ class MomentSystem:
         material = {"saturation": self.material.saturation, "slope": self.material.slope}
         return {"moments": self.moments, **material, **inner}
 
+    def start_arrays(self) -> list[wp.array]:
+        """Return the arrays from which the next solve starts; restore copies and :meth:`restart` to repeat it."""
+        return [*solve_state.start_arrays(self._induction), *self.dynamics.persistent_arrays().values()]
+
+    def restart(self, rejected: wp.array) -> None:
+        """Start the next solve from :meth:`start_arrays` alone if ``rejected`` is not 0, int32, shape [1]."""
+        solve_state.launch_restart(self._induction, rejected)
+
     def field_arrays(self) -> list[wp.array]:
         """Return the arrays that the caller writes before a solve, and the field that it leaves.
 

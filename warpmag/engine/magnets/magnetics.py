@@ -393,8 +393,17 @@ class Magnetics:
         return self.system.persistent_arrays() | {f"few.{name}": array for name, array in few.items()}
 
     def stepped_arrays(self) -> list[wp.array]:
-        """Return the arrays that :meth:`induce` advances by ``dt``; restore copies of them to repeat a step."""
-        return [] if self.coils is None else self.coils.stepped_arrays()
+        """Return the currents and the start of the induction; restore copies and :meth:`restart` to repeat a step."""
+        currents = [] if self.coils is None else self.coils.stepped_arrays()
+        return currents + [array for system in self._systems for array in system.start_arrays()]
+
+    def restart(self, rejected: wp.array) -> None:
+        """Discard what the induction remembers of a step that is repeated, if ``rejected`` is not 0, shape [1].
+
+        Its magnetizations are those of other poses, from which the induction converges slowly.
+        """
+        for system in self._systems:
+            system.restart(rejected)
 
     def check_model(self) -> None:
         """Raise :class:`InputError` if ``model.warpmag`` was changed without a notification; waits for the device."""

@@ -111,9 +111,9 @@ class Stepper:
             travel=TRAVEL_LIMIT, shared_travel=_SHARED_TRAVEL_LIMIT, overlap=OVERLAP_LIMIT,
             growth_margin=_GROWTH_MARGIN, futile_ratio=_FUTILE_RATIO,
         )  # fmt: skip
-        currents = magnetics.stepped_arrays()
+        stepped = [array.flatten() for array in magnetics.stepped_arrays() if array.size]
         self._machine.set_state_arrays(
-            _arrays(self._state) + currents, _arrays(self._saved) + [wp.clone(array) for array in currents]
+            _arrays(self._state) + stepped, _arrays(self._saved) + [wp.clone(array) for array in stepped]
         )
         self._arrays = self._machine.arrays
         self._watched = self._machine.make_monitor(sizes.thickness, sizes.force_length, sizes.reach)
@@ -341,6 +341,7 @@ class Stepper:
         self._find_first_contacts(substep=monitor.NEXT_SUBSTEP)
         machine.end_attempt()
         machine.restore()
+        self._magnetics.restart(machine.rejected)
 
     def _advance_twice(self, level: int) -> None:
         """Run a pair of substeps of the longest length over ``2**level``."""

@@ -100,7 +100,7 @@ def irregular_file(path: str | os.PathLike) -> str:
     """Return the reason not to open a path: it is a device, a pipe or a file of the system. Empty otherwise."""
     try:
         real = os.path.realpath(path)
-        mode = os.stat(real).st_mode
+        mode = os.stat(path).st_mode  # of the path itself: the real path of a pipe without a name does not exist
     except PermissionError:  # links of /proc to other processes
         return f"{path} is not a regular file, or its links cannot be read"
     except OSError:  # USD reports missing files
