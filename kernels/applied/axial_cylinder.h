@@ -35,11 +35,9 @@ CUDA_CALLABLE inline CurlFreeField field_of(const AxialCylinder& cylinder, Vecto
     Number e = zero, h_z = zero, f = zero, z_z = zero; // as in solenoid.h
     for (int k = begin; k < 2; k += step) {
         const Real sign = Real(1 - 2 * k);
-        const SheetEnd<Number> end(a, root(at.rho2), at.z + sign * b, larger(least2, tiny));
-        const Number q[] = {end.q};
+        Number q[1], values[1][4];
         Cel<Number> integrals[1][4];
-        for (int n = 0; n < 4; ++n) integrals[0][n] = end.integrals[n];
-        Number values[1][4];
+        put_sheet_end<Number>(a, root(at.rho2), at.z + sign * b, larger(least2, tiny), q[0], integrals[0]);
         evaluate<Number>(q, integrals, values);
         e += sign * values[0][0], h_z += sign * values[0][1], f += sign * values[0][2], z_z += sign * values[0][3];
     }

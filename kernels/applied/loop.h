@@ -26,7 +26,10 @@ template <class N> CUDA_CALLABLE inline N square_root(N x) {
     if constexpr (sizeof(N) > sizeof(double)) return root(x);
     else return sqrt(x);
 }
-template <class N> CUDA_CALLABLE inline N magnitude(N x) { return x < 0 ? -x : x; }
+template <class N> CUDA_CALLABLE inline N magnitude(N x) {
+    if constexpr (sizeof(N) > sizeof(double)) return larger(x, -x);
+    else return fabs(x);
+}
 
 // factor × cel(q, p, c, s), with p and the sums c and s after the first step of the iteration.
 template <class N> struct Cel {

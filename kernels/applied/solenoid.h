@@ -10,32 +10,26 @@
 
 namespace warpmag {
 
-// Integrals of one end of a thin sheet of current of radius a, at the height z above that end: H_ρ/ρ, H_z, (∂H_ρ/∂z)/ρ
-// and ∂H_z/∂z of 2πb ampere-turns are those of the upper end less those of the lower end.
-template <class N> struct SheetEnd {
-    N q;
-    Cel<N> integrals[4];
-
-    CUDA_CALLABLE SheetEnd(N a, N rho, N z, N least2) {
-        const N one = 0 * a + 1, tiny = number<N>(is_double<N> ? 1e-100 : 1e-6);
-        N gamma = (a - rho) / (a + rho);
-        gamma = magnitude(gamma) < tiny ? tiny : gamma; // H_z jumps at the sheet: points on it count as inside
-        const N size = magnitude(gamma), sign = gamma > 0 ? one : -one;
-        const LoopPoint<N> at(a, rho, z, least2);
-        q = at.q;
-        integrals[0] = {-8 * a * a / (at.beta2 * at.beta * (1 + q)), 1 + q, 0 * a, one};
-        integrals[1] = {a / (a + rho) * (at.z / at.beta), q / size + size, 1 + 1 / gamma, 2 * (sign + q / size)};
-        integrals[2] = at.radial(), integrals[3] = at.axial();
-    }
-};
+// Writes q and the integrals of one end of a thin sheet of current of radius a, at the height z above that end. H_ρ/ρ,
+// H_z, (∂H_ρ/∂z)/ρ and ∂H_z/∂z of 2πb ampere-turns are those of the upper end less those of the lower end.
+template <class N> CUDA_CALLABLE inline void put_sheet_end(N a, N rho, N z, N least2, N& q, Cel<N> (&integrals)[4]) {
+    const N one = 0 * a + 1, tiny = number<N>(is_double<N> ? 1e-100 : 1e-6);
+    N gamma = (a - rho) / (a + rho);
+    gamma = magnitude(gamma) < tiny ? tiny : gamma; // H_z jumps at the sheet: points on it count as inside
+    const N size = magnitude(gamma), sign = gamma > 0 ? one : -one;
+    const LoopPoint<N> at(a, rho, z, least2);
+    q = at.q;
+    integrals[0] = {-8 * a * a / (at.beta2 * at.beta * (1 + q)), 1 + q, 0 * a, one};
+    integrals[1] = {a / (a + rho) * (at.z / at.beta), q / size + size, 1 + 1 / gamma, 2 * (sign + q / size)};
+    integrals[2] = at.radial(), integrals[3] = at.axial();
+}
 // Field of a thin sheet of radius a from z = −b to b, of 2πb ampere-turns.
 CUDA_CALLABLE inline PointField thin_solenoid(double a, double b, Point x) {
     const double rho = sqrt(x.x * x.x + x.y * x.y);
-    const SheetEnd<double> upper(a, rho, x.z + b, 0), lower(a, rho, x.z - b, 0);
-    const double q[] = {upper.q, lower.q};
+    double q[2], values[2][4];
     Cel<double> integrals[2][4];
-    for (int n = 0; n < 4; ++n) integrals[0][n] = upper.integrals[n], integrals[1][n] = lower.integrals[n];
-    double values[2][4];
+    put_sheet_end<double>(a, rho, x.z + b, 0, q[0], integrals[0]);
+    put_sheet_end<double>(a, rho, x.z - b, 0, q[1], integrals[1]);
     evaluate<double>(q, integrals, values);
     const auto difference = [&](int n) { return values[0][n] - values[1][n]; };
     const double e = difference(0), hz = difference(1), f = difference(2), zz = difference(3);
