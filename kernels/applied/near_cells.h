@@ -16,8 +16,8 @@
 
 namespace warpmag {
 
-constexpr int FACE_POINTS = 16, OUTER_POINTS = 6 * FACE_POINTS; // as in near_cells.py
-constexpr int FINE_POINTS = 9 * FACE_POINTS, COARSE_POINTS = 16, CELL_POINTS = FINE_POINTS + COARSE_POINTS;
+constexpr int FACE_POINTS = 16, OUTER_POINTS = 6 * FACE_POINTS, MIDDLE_POINTS = 16; // as in near_cells.py
+constexpr int FINE_POINTS = OUTER_POINTS + MIDDLE_POINTS, COARSE_POINTS = 16, CELL_POINTS = FINE_POINTS + COARSE_POINTS;
 enum Nearness {
     FAR_CELL,
     STEEP_CELL,

@@ -18,6 +18,7 @@ from warpmag.kernels.shared.reductions import most_blocks
 
 FACE_SPLIT = 4  # squares along each side of a face
 FACE_POINTS = FACE_SPLIT**2  # points of a face; as in ``near_cells.h``
+MIDDLE_POINTS = 16  # four points on each plane through the middle of a cell, and padding; as in ``near_cells.h``
 COARSE_POINTS = 16  # points of a cell for differences at a distance, and padding; as in ``near_cells.h``
 NEAR = 2  # value of ``near`` of cells over which fields are averaged; as in ``near_cells.h``
 CELL_REACH = 0.75, 1.25
@@ -80,23 +81,32 @@ def cell_arrays_type(dtype):
 
 
 def unit_points() -> np.ndarray:
-    """Return the points of a cell and the charges at them, shape [9, 9 FACE_POINTS + COARSE_POINTS].
+    """Return the points of a cell and the charges at them, shape [9, 6 FACE_POINTS + MIDDLE_POINTS + COARSE_POINTS].
 
     Rows are the positions in a cube of half side 1, the charges by moments along the axes, and those by differences
-    of the halves along the axes. The fine points are those of the faces −x, +x, −y, ... and of the planes x, y, z = 0;
-    their charges have weights 1/FACE_POINTS. The coarse points are the centers of the faces, and of the cell.
+    of the halves along the axes. The fine points are those of the faces −x, +x, −y, ..., and Gauss points of the planes
+    x, y, z = 0; their charges have weights 1/FACE_POINTS. The coarse points are the centers of the faces, and of the
+    cell. The potential varies less over the planes than over the faces.
     """
     middles = (2.0 * np.arange(FACE_SPLIT) + 1.0) / FACE_SPLIT - 1.0
-    u, v = (values.ravel() for values in np.meshgrid(middles, middles, indexing="ij"))
-    fine, coarse = np.zeros((9, 9, FACE_POINTS)), np.zeros((9, COARSE_POINTS))
-    for plane in range(9):
-        axis, height = (plane // 2, 2.0 * (plane % 2) - 1.0) if plane < 6 else (plane - 6, 0.0)
+    of_face, of_plane = (
+        [values.ravel() for values in np.meshgrid(line, line, indexing="ij")]
+        for line in (middles, np.array([-1.0, 1.0]) / np.sqrt(3.0))
+    )
+    fine, middle, coarse = np.zeros((9, 6, FACE_POINTS)), np.zeros((9, MIDDLE_POINTS)), np.zeros((9, COARSE_POINTS))
+    for face in range(6):
+        axis, height = face // 2, 2.0 * (face % 2) - 1.0
         first, second = (k for k in range(3) if k != axis)
-        fine[axis, plane], fine[first, plane], fine[second, plane] = height, u, v
-        fine[3 + axis, plane], fine[6 + axis, plane] = height, 1.0 if height else -2.0
-        coarse[axis, min(plane, 6)] = height
-        coarse[6 + axis, min(plane, 6)] = 1.0 if height else -2.0
-    return np.concatenate([fine.reshape(9, -1), coarse], axis=1)
+        fine[axis, face], fine[first, face], fine[second, face] = height, *of_face
+        fine[3 + axis, face], fine[6 + axis, face] = height, 1.0
+        coarse[axis, face], coarse[6 + axis, face] = height, 1.0
+    for axis in range(3):
+        first, second = (k for k in range(3) if k != axis)
+        points = slice(4 * axis, 4 * axis + 4)
+        middle[first, points], middle[second, points] = of_plane
+        middle[6 + axis, points] = -2.0 * FACE_POINTS / 4.0
+        coarse[6 + axis, 6] = -2.0
+    return np.concatenate([fine.reshape(9, -1), middle, coarse], axis=1)
 
 
 def _axes(rotation: np.ndarray) -> np.ndarray:
