@@ -1,8 +1,9 @@
 """Steps of bodies as a whole, added to the field before each step of the accelerated θ flow.
 
 The residual of a body's moments, r = k H/Ms − s, becomes r + w (Q − 1) r with the inverse Q of the body's own operator
-(``warpmag.shapes.body_response``). The flow then takes its usual step. Q r is the error of a lone body, and ⟨r, Q r⟩ the
-square of its energy norm, by which solves end (``theta_step.h``).
+(``warpmag.shapes.body_response``). The flow then takes its usual step. Q r is the error of a lone body, and ⟨r, Q r⟩
+the square of its energy norm, by which solves end (``theta_step.h``).
+
 Q belongs to χ = ∞ without saturation, and to bodies that do not intersect. Let d be the mean of (k/3) ‖M‖/(Ms ‖s‖) over
 the body, and e that of 2 k o_i (``theta_flow.py``) beyond contact. Where Q divides a mode by λ, λ' = 1 − d (1 − λ) + e
 would be right. So w = (1/λ' − 1)/(1/λ − 1) with the least λ of the body, and at least 0, exceeds the factor of no mode.

@@ -77,7 +77,7 @@ def state_type(dtype):
         near_count: wp.array[int]  # length of the longest list of each vector; on a GPU neighbors of a moment
         h0: wp.array[vec3]  # applied field [A/m], external and of permanent magnets, shape [n]
         h: wp.array[vec3]  # total field [A/m], shape [n]
-        h_change: wp.array[vec3]  # part of ``h`` by steps of bodies as a whole (``body_steps``), shape [n]; None without
+        h_change: wp.array[vec3]  # part of ``h`` by steps of bodies as a whole [A/m], shape [n]; None without
         s: wp.array[vec3]  # dual variable [dimensionless], shape [n]
         mixed_s: wp.array[vec3]  # last mixture of iterates, shape [n]
         mixed_r: wp.array[vec3]  # its residual
