@@ -9,6 +9,7 @@
 // ``BodySteps`` is the struct of body_steps.py.
 #pragma once
 #include "cells/rotation.h"
+#include "induction/spans.h"
 #include "shared/group.h"
 #include "shared/team.h"
 
@@ -22,10 +23,11 @@ template <class Steps> CUDA_CALLABLE inline bool skips_steps(const Steps& steps,
     const auto& solve = steps.state.worlds.data[world];
     return solve.active == 0 || solve.apart > 0;
 }
-// Elements of an array of moments from moment i on.
-template <class Array> CUDA_CALLABLE inline const Real* elements(const Array& array, int i, int row = 0) {
-    const char* const begin = (const char*)array.data + row * (size_t)array.strides[0];
-    return (const Real*)begin + sizeof(*array.data) / sizeof(Real) * i;
+// Cells of a body from ``offset`` on.
+template <class Steps> CUDA_CALLABLE inline Span cells_at(const Steps& steps, int body, int offset) {
+    const auto& cells = steps.body.data[body]; // first moment, count, rotation, world
+    const int left = cells[1] - offset;
+    return {0, cells[0] + offset, left < 0 ? 0 : left > WIDTH ? WIDTH : left, cells[3], 0, 0};
 }
 template <class Steps> CUDA_CALLABLE inline Rotation<Real> rotation_of_body(const Steps& steps, int body) {
     return rotation_of<Real>(steps.rotation.data[steps.body.data[body][2]]);
@@ -37,39 +39,36 @@ template <class Steps> CUDA_CALLABLE inline Real* residuals_of(const Steps& step
 
 // Writes k H/Ms − s of the cells of a body from ``offset`` on.
 template <class Steps> CUDA_CALLABLE inline void write_residuals(const Steps& steps, int body, int offset) {
-    const auto& cells = steps.body.data[body]; // first moment, count, rotation, world
-    if (share() != 0 || offset >= cells[1] || skips_steps(steps, cells[3])) return;
-    const int i = cells[0] + offset, left = cells[1] - offset, count = left > WIDTH ? WIDTH : left;
-    const Number slope = numbers_or(elements(steps.state.slope, i), count, 0);
-    const Number factor = slope / numbers_or(elements(steps.state.saturation, i), count, 1);
-    const Vector residual =
-        factor * vectors(elements(steps.state.h, i), count) - vectors(elements(steps.state.s, i), count);
+    const Span at = cells_at(steps, body, offset);
+    if (share() != 0 || at.count == 0 || skips_steps(steps, at.world)) return;
+    const Number slope = numbers_or(entries(steps.state.slope, at), at.count, 0);
+    const Number factor = slope / numbers_or(entries(steps.state.saturation, at), at.count, 1);
+    const Vector residual = factor * get(steps.state.h, at) - get(steps.state.s, at);
     const Vector local = to_body(rotation_of_body(steps, body), residual);
     Real* const out = residuals_of(steps, body / MEMBERS) + body % MEMBERS;
-    for (int l = 0; l < count; ++l) {
-        Real* const at = out + 3 * MEMBERS * (size_t)(offset + l);
-        at[0] = lane_of(local.x, l), at[MEMBERS] = lane_of(local.y, l), at[2 * MEMBERS] = lane_of(local.z, l);
+    for (int l = 0; l < at.count; ++l) {
+        Real* const to = out + 3 * MEMBERS * (size_t)(offset + l);
+        to[0] = lane_of(local.x, l), to[MEMBERS] = lane_of(local.y, l), to[2 * MEMBERS] = lane_of(local.z, l);
     }
 }
 
 // Writes the weight of a body from the means of the shares d and the excesses e of its cells.
 template <class Steps> CUDA_CALLABLE inline void write_weight(const Steps& steps, int body) {
     const auto& cells = steps.body.data[body];
+    const auto& state = steps.state;
     if (cells[1] == 0 || skips_steps(steps, cells[3])) return;
     Number shares = Number(Real(0)), excesses = shares;
     const Number zero = shares, full = zero + 1;
     for (int k = WIDTH * share(); k < cells[1]; k += WIDTH * SHARES) {
-        const int i = cells[0] + k, left = cells[1] - k, count = left > WIDTH ? WIDTH : left;
-        const Number radius = numbers_or(elements(steps.state.packed, i, 3), count, 0);
-        const Number slope = numbers_or(elements(steps.state.slope, i), count, 0);
-        const Number saturation = numbers_or(elements(steps.state.saturation, i), count, 1);
-        const Number most = Real(4.18879020478639) * radius * radius * radius * saturation
-                            * length(vectors(elements(steps.state.s, i), count));
-        const Number moment = length(vectors(elements(steps.state.moments, i), count));
+        const Span at = cells_at(steps, body, k);
+        const Number radius = numbers_or(entries(state.packed, at, 3), at.count, 0);
+        const Number slope = numbers_or(entries(state.slope, at), at.count, 0);
+        const Number saturation = numbers_or(entries(state.saturation, at), at.count, 1);
+        const Number volume = Real(4.18879020478639) * radius * radius * radius;
+        const Number most = volume * saturation * length(get(state.s, at)), moment = length(get(state.moments, at));
         const Number linear = mask_of(most > moment) ? moment / larger(most, moment) : full;
         shares += slope * (Real(1) / 3) * linear;
-        const Number stiffness =
-            Real(2 * FLOW_STEP) / numbers_or(elements(steps.state.step, i), count, 2 * FLOW_STEP) - 1;
+        const Number stiffness = Real(2 * FLOW_STEP) / numbers_or(entries(state.step, at), at.count, 2 * FLOW_STEP) - 1;
         excesses += larger(stiffness - slope * Real(2.0 / 3 + CONTACT), zero);
     }
     shares = group_sum(shares), excesses = group_sum(excesses);
@@ -132,19 +131,16 @@ template <class Steps> CUDA_CALLABLE inline void add_changes(const Steps& steps,
         add_products(pair_residuals, sums, [&](int k) { return lower_number(words[k]); });
         add_products(pair_residuals + 3 * MEMBERS, sums, [&](int k) { return upper_number(words[k]); });
     }
-    const int left = cells - offset, count = left > WIDTH ? WIDTH : left;
     for (int w = 0; w < MEMBERS; ++w) {
         const Vector response = group_sums(sums[w]);
-        if (share() != 0 || w >= of_group[0] || left <= 0) continue;
-        const auto& body = steps.body.data[first_body + w];
-        if (skips_steps(steps, body[3])) continue;
-        const int i = body[0] + offset;
-        const Number scale = numbers_or(elements(steps.state.saturation, i), count, 0)
-                             / numbers_or(elements(steps.state.slope, i), count, 1) * steps.weight.data[first_body + w];
+        const Span at = cells_at(steps, first_body + w, offset);
+        if (share() != 0 || at.count == 0 || skips_steps(steps, at.world)) continue;
+        const Number scale = numbers_or(entries(steps.state.saturation, at), at.count, 0)
+                             / numbers_or(entries(steps.state.slope, at), at.count, 1)
+                             * steps.weight.data[first_body + w];
         const Vector change = scale * to_world(rotation_of_body(steps, first_body + w), response);
-        Real* const h = (Real*)elements(steps.state.h, i);
-        put_vectors(h, count, vectors(h, count) + change);
-        put_vectors((Real*)elements(steps.state.h_change, i), count, change);
+        set(steps.state.h, at, get(steps.state.h, at) + change);
+        set(steps.state.h_change, at, change);
     }
 }
 

@@ -59,8 +59,7 @@ def state_type(dtype):
         overlap: wp.array2d[int]
         overlap_count: wp.array[int]
         searching: wp.array[int]
-        # Materials (``curves.CurveParameters``):
-        saturation: wp.array[dtype]
+        saturation: wp.array[dtype]  # this and the next are materials (``curves.CurveParameters``)
         slope: wp.array[dtype]
         curve: wp.array[int]
         common_curve: int
