@@ -38,7 +38,8 @@ PEAK_DEPTH = 6  # penetration [m]
 PEAK_ERROR = 7  # magnetization error [1]
 PEAKS = 8
 
-COUNT_BAD_BODY = 0  # first body whose state was not finite, see ``watch``; else NO_BODY
+HIGHEST_SPEED = 1e7  # [m/s]; a faster body is lost, as one whose state is not finite. Newtonian mechanics ends there.
+COUNT_BAD_BODY = 0  # first body whose state was not finite or that was faster, see ``watch``; else NO_BODY
 COUNT_EVALUATIONS = 1  # field evaluations, summed over solves
 COUNT_UNCONVERGED = 2  # induction solves that did not converge
 COUNT_OVERLAPS = 3  # contacts deeper than a threshold
@@ -122,12 +123,13 @@ def _watch_body(m: Monitor, bodies: BodyView, body: int, substep: int, dt: float
         total += wp.abs(bodies.q[body][k])
     for k in range(6):
         total += wp.abs(bodies.qd[body][k])
+    speed = wp.length(wp.spatial_top(bodies.qd[body]))
     # an angular velocity whose square overflows leaves an orientation of zero
-    if not wp.isfinite(total) or wp.length(wp.transform_get_rotation(bodies.q[body])) < 0.5:
+    has_orientation = wp.length(wp.transform_get_rotation(bodies.q[body])) >= 0.5
+    if not wp.isfinite(total) or not has_orientation or speed > wp.static(HIGHEST_SPEED):
         wp.atomic_min(m.counts, COUNT_BAD_BODY, (m.substeps[0] + wp.max(substep, 0)) * bodies.qd.shape[0] + body)
     thickness = m.thickness[body]
     if thickness < wp.inf:
-        speed = wp.length(wp.spatial_top(bodies.qd[body]))
         turning = m.reach[body] * wp.length(wp.spatial_bottom(bodies.qd[body]))
         weighted_time = UNCONSTRAINED_WEIGHT * dt
         travel = weighted_time * (speed + turning) / thickness

@@ -220,7 +220,8 @@ class Simulation:
         """The present state; waits for the device.
 
         Raises:
-            SimulationError: A step led to a state that is not finite. The last accepted state remains.
+            SimulationError: A step led to a state that is not finite, or to a speed above 1e7 m/s. The last accepted
+                state remains.
         """
         self._read_reports()
         return self._stepper.state
@@ -289,7 +290,8 @@ class Simulation:
         """Advance by one step; does not wait for a GPU.
 
         Raises:
-            SimulationError: A step led to a state that is not finite. A GPU raises it up to 64 steps later.
+            SimulationError: A step led to a state that is not finite, or to a speed above 1e7 m/s. A GPU raises it up
+                to 64 steps later.
         """
         self._stepper.advance()
         if self._stepper.reports_due:
@@ -308,7 +310,8 @@ class Simulation:
 
         Raises:
             InputError: ``worlds`` is not such a mask.
-            SimulationError: A step led to a state that is not finite. Call this method again to go on.
+            SimulationError: A step led to a state that is not finite, or to a speed above 1e7 m/s. Call this method
+                again to go on.
         """
         if not wp.get_device(self.model.device).is_capturing:
             self._read_reports()

@@ -239,7 +239,8 @@ class Stepper:
             self._machine.set_status(status, 0)
         self._machine.set_status(stepping.STATUS_HALT, stepping.RUNNING)  # the user may repair the state
         label = self._model.body_label[body]
-        raise SimulationError(f"step {number} ({number * self._step:g} s): the state of {label} is not finite any more")
+        time, most = f"step {number} ({number * self._step:g} s)", monitor.HIGHEST_SPEED
+        raise SimulationError(f"{time}: the state of {label} is not finite any more, or faster than {most:g} m/s")
 
     def _fills(self) -> np.ndarray:
         return self._read("counts")[monitor.COUNT_CAPACITIES :]
