@@ -86,7 +86,7 @@ USUAL = ("body", "magnetization", "saturation", "radius", "device", "dtype", "dt
 """Optional arguments that are given in most calls, as users do."""
 PASSIVE = {"persistent_arrays", "stepped_arrays", "warnings", "frame", "allow_restart", "stay"}
 """Methods without arguments that return no numbers, or only when a viewer is closed."""
-UNDOCUMENTED = {"add_step", "save", "load"}
+UNDOCUMENTED = {"add_step", "save", "load", "discard_attempt"}
 """Methods that runs call, and that the pages leave out."""
 
 

@@ -397,7 +397,7 @@ class Magnetics:
         currents = [] if self.coils is None else self.coils.stepped_arrays()
         return currents + [array for system in self._systems for array in system.start_arrays()]
 
-    def restart(self, rejected: wp.array) -> None:
+    def discard_attempt(self, rejected: wp.array) -> None:
         """Discard what the induction remembers of a step that is repeated, if ``rejected`` is not 0, shape [1].
 
         Its magnetizations are those of other poses, from which the induction converges slowly.

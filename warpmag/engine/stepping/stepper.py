@@ -342,7 +342,7 @@ class Stepper:
         self._find_first_contacts(substep=monitor.NEXT_SUBSTEP)
         machine.end_attempt()
         machine.restore()
-        self._magnetics.restart(machine.rejected)
+        self._magnetics.discard_attempt(machine.rejected)
 
     def _advance_twice(self, level: int) -> None:
         """Run a pair of substeps of the longest length over ``2**level``."""
