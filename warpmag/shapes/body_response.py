@@ -13,7 +13,7 @@ from warpmag.shapes.lattice import Lattice
 from warpmag.shapes.uniform_response import cell_matrix
 
 MOST_CELLS = 1000
-"""Largest number of cells of a body with a response: a table of 18 MB. That of 722 cells takes 0.8 s and 9.4 MB."""
+"""Largest number of cells of a body with a response: a table of 18 MB. That of 722 cells takes 1 s and 9.4 MB."""
 _SLOPE = 3.0
 """Initial slope k = 3χ/(3 + χ) of a ball of χ = ∞."""
 _SHIFT = 0.01
