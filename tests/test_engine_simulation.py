@@ -184,7 +184,7 @@ def test_contacts_at_the_end_of_a_step_serve_the_next_one(device, monkeypatch):
 
 
 def test_a_repeated_step_starts_from_the_magnetizations_at_its_begin(device, monkeypatch):
-    """Those of the rejected attempt belong to other poses: a repeated first solve took 6 evaluations, not 3."""
+    """A repeated first solve takes 3 evaluations; from the magnetizations of the rejected attempt it took 6."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     warpmag.register_attributes(builder)
     for number in range(12):
