@@ -471,6 +471,7 @@ def test_a_moment_of_an_impossible_magnetization(device, tmp_path):
         ("external field", (0.0, 1e9, 0.0), r"an applied field of 1e\+09 A/m"),
         ("magnetization", (0.0, 0.0, 1e38), r"a magnetization of 1e\+38 A/m"),
         ("strength", 1e28, r"a coil's current \[A\] or a field map's factor of 1e\+28"),
+        ("voltage", 1e12, r"a coil's voltage of 1e\+12 V"),
     ],
 )
 def test_a_run_that_ends_names_a_strength_beyond_all_measure(device, tmp_path, monkeypatch, name, value, cause):
@@ -507,6 +508,13 @@ def test_a_point_instancer_as_a_collider_of_a_magnet(tmp_path):
     assert [str(error) for error in report.errors] == [
         "/Ball: a magnet without colliders that are solid: no shape to magnetize"
     ]
+
+
+def test_an_axis_of_a_shape_that_has_none(device, tmp_path):
+    """A stranger's attribute of any type on a static magnet."""
+    body = ball("float3 axis = (0, 1, 0)").replace('"PhysicsRigidBodyAPI", ', "")
+    assert "PhysicsRigidBodyAPI" not in body
+    assert len(Simulation(write(tmp_path, body), device=device).magnetics.shapes) == 1
 
 
 def test_a_file_that_changed_is_read_again(tmp_path):

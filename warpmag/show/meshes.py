@@ -7,6 +7,7 @@ import numpy as np
 from pxr import Gf, Usd, UsdGeom, Vt
 
 from warpmag.shapes.polygons import triangulate
+from warpmag.usd.schemas import shape_axis
 
 _AROUND = 48
 """Corners of a ball's equator and of other circles."""
@@ -32,7 +33,7 @@ def shape_of(prim: Usd.Prim) -> Shape | None:
     for kind, (make, *sizes) in _MAKERS.items():
         if prim.IsA(kind):
             points, faces = make(*(prim.GetAttribute(name).Get() for name in sizes))
-            axis = prim.GetAttribute("axis").Get() if prim.HasAttribute("axis") else "Z"
+            axis = shape_axis(prim.GetStage(), prim.GetPath()) or "Z"
             return np.roll(points, {"X": 1, "Y": 2, "Z": 0}[axis], axis=1), faces  # (x, y, z) → (z, x, y)
     return None
 

@@ -157,9 +157,12 @@ def collider_magnet(collider: Usd.Prim) -> ColliderMagnet | None:
 
 
 def shape_axis(stage: Usd.Stage, path: str | Sdf.Path) -> str | None:
-    """Return the token of the axis of the capsule, cylinder or cone at a path, None for other shapes."""
-    axis = stage.GetPrimAtPath(path).GetAttribute("axis")
-    return axis.Get() if axis else None
+    """Return the token of the axis of the capsule, cylinder or cone at a path, None for other shapes.
+
+    On other shapes an attribute of that name is a stranger's, of any type.
+    """
+    prim = stage.GetPrimAtPath(path)
+    return prim.GetAttribute("axis").Get() if "axis" in prim.GetPrimDefinition().GetPropertyNames() else None
 
 
 def world_matrix(prim: Usd.Prim) -> np.ndarray:

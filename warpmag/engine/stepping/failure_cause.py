@@ -7,7 +7,7 @@ from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.engine.stepping.statistics import Statistics
 
 _STRONGEST_FIELD = 1e8
-"""Field, magnetization [A/m] or current [A] above which an error names it as the cause: ten times practical maxima."""
+"""Field, magnetization [A/m], current [A] or voltage [V], ten times practical maxima, that an error names as the cause."""
 
 
 def failure_cause(magnetics: Magnetics, statistics: Statistics, joint_gaps: dict[str, float]) -> str:
@@ -26,6 +26,7 @@ def failure_cause(magnetics: Magnetics, statistics: Statistics, joint_gaps: dict
         "an applied field of {:.3g} A/m": magnetics.external_field.numpy(),
         "a magnetization of {:.3g} A/m": attributes.magnetization.numpy(),
         "a coil's current [A] or a field map's factor of {:.3g}": attributes.strength.numpy(),
+        "a coil's voltage of {:.3g} V": attributes.voltage.numpy(),
     }
     for name, values in strengths.items():
         strongest = float(np.abs(values).max(initial=0.0))
