@@ -7,7 +7,7 @@ from warpmag.engine.magnets.magnetics import Magnetics
 from warpmag.engine.stepping.statistics import Statistics
 
 _STRONGEST_FIELD = 1e8
-"""Field, magnetization [A/m], current [A] or voltage [V], ten times practical maxima, that an error names as the cause."""
+"""Strength [A/m], [A] or [V] above which an error names it as the cause: ten times practical maxima."""
 
 
 def failure_cause(magnetics: Magnetics, statistics: Statistics, joint_gaps: dict[str, float]) -> str:
