@@ -2,9 +2,10 @@
 //
 // The field at a cell's center does not represent a cell near the edge of a magnet, where the field varies over less
 // than a cell. There the average of the field over the cell is taken, H̄ = −Σ n φ̄ A/V over its faces, with the
-// mean potential φ̄ of FACE_POINTS points of a face. A face in front of a magnet has charges that vary over less than a
-// cell, too. They respond with q = −R φ to the potentials φ at the points, less that of the average field, and have the
-// energy −½ μ0 φᵀ R φ. Python computes R (``warpmag.shapes.face_charges``); it leaves out uniform charges.
+// mean potential φ̄ of points of a face. A face on the body's surface in front of a magnet has charges that vary over
+// less than a cell, too. They respond with q = −R φ to the potentials φ at FACE_POINTS points, less that of the average
+// field, and have the energy −½ μ0 φᵀ R φ. Python computes R (``warpmag.shapes.face_charges``); it leaves out uniform
+// charges.
 //
 // Both fade with the distance of a cell from the body, in longest sides of the cell. Forces are the derivatives of the
 // energy at constant permeability of the cell. Takes CELL_REACH_LOW, CELL_REACH_HIGH, STEEP_REACH_LOW and
@@ -16,21 +17,23 @@
 
 namespace warpmag {
 
-constexpr int FACE_POINTS = 16, OUTER_POINTS = 6 * FACE_POINTS, MIDDLE_POINTS = 16; // as in near_cells.py
-constexpr int FINE_POINTS = OUTER_POINTS + MIDDLE_POINTS, COARSE_POINTS = 16, CELL_POINTS = FINE_POINTS + COARSE_POINTS;
+constexpr int FACE_POINTS = 16, MOST_OUTER = 6 * FACE_POINTS, COARSE_POINTS = 16; // as in near_cells.py
 enum Nearness {
     FAR_CELL,
     STEEP_CELL,
     NEAR_CELL
 }; // fields: at the center, with differences, averaged; as in near_cells.py
 
-// A range of the tables of points.
-struct PointRange {
-    int first, last;
-    Real weight; // of a point in its face
+// Points of a cell whose half sides are 1, and charges at them, shape [9, count] (near_cells.py). The first ``outer``
+// are on outer faces.
+struct CellPoints {
+    const Real* data;
+    int count, outer;
+    CUDA_CALLABLE const Real* row(int row, int k) const { return data + row * count + k; }
 };
-CUDA_CALLABLE inline PointRange fine_points() { return {0, FINE_POINTS, Real(1.0 / FACE_POINTS)}; }
-CUDA_CALLABLE inline PointRange coarse_points() { return {FINE_POINTS, CELL_POINTS, 1}; }
+template <class Arrays> CUDA_CALLABLE inline CellPoints coarse_points(const Arrays& arrays) {
+    return {arrays.cells.point.data, COARSE_POINTS, 0};
+}
 
 // A cell in the world. The axes are those of its grid; ``outer`` has a bit for each face on the surface of the body.
 struct Cell {
@@ -38,38 +41,41 @@ struct Cell {
     Real half[3], size, radius, label, response;
     int moment, first, last, outer; // ``first`` and ``last``: range of permanent bodies
     const Real* matrices;           // R of a face across each axis, for an ideally permeable body
+    CellPoints fine;
 
-    // Points k and its successors; ``units`` are all points of a cube of half side 1.
-    CUDA_CALLABLE Vector points(const Real* units, int k) const {
+    // Points k and its successors.
+    CUDA_CALLABLE Vector points(const CellPoints& all, int k) const {
         Vector x = broadcast(center);
-        for (int a = 0; a < 3; ++a) x += (half[a] * numbers(units + a * CELL_POINTS + k)) * broadcast(axes[a]);
+        for (int a = 0; a < 3; ++a) x += (half[a] * numbers(all.row(a, k))) * broadcast(axes[a]);
         return x;
     }
-    CUDA_CALLABLE Vector local_points(const Real* units, int k) const {
-        return {half[0] * numbers(units + k), half[1] * numbers(units + CELL_POINTS + k),
-                half[2] * numbers(units + 2 * CELL_POINTS + k)};
+    CUDA_CALLABLE Vector local_points(int k) const {
+        return {half[0] * numbers(fine.row(0, k)), half[1] * numbers(fine.row(1, k)),
+                half[2] * numbers(fine.row(2, k))};
     }
-    // Charges at these points by moments along the axes: rows 3 to 5 of ``units`` for means, 6 to 8 for differences.
-    CUDA_CALLABLE Number charges(const Real* units, int row, int k, Real of_face, Real3 m) const {
-        const Real* const weight = units + row * CELL_POINTS + k;
-        return of_face
-               * (m.x / (2 * half[0]) * numbers(weight) + m.y / (2 * half[1]) * numbers(weight + CELL_POINTS)
-                  + m.z / (2 * half[2]) * numbers(weight + 2 * CELL_POINTS));
+    // Charges at these points by moments along the axes: of rows 3 to 5 for means, 6 to 8 for differences.
+    CUDA_CALLABLE Number charges(const CellPoints& all, int row, int k, Real3 m) const {
+        return m.x / (2 * half[0]) * numbers(all.row(row, k)) + m.y / (2 * half[1]) * numbers(all.row(row + 1, k))
+               + m.z / (2 * half[2]) * numbers(all.row(row + 2, k));
     }
     // Adds −Σ φ times the charges by unit moments along the axes to ``sums``.
-    CUDA_CALLABLE void add_mean_field(const Real* units, int row, int k, Real of_face, Number phi, Vector& sums) const {
-        const Real* const weight = units + row * CELL_POINTS + k;
-        sums.x -= of_face / (2 * half[0]) * numbers(weight) * phi;
-        sums.y -= of_face / (2 * half[1]) * numbers(weight + CELL_POINTS) * phi;
-        sums.z -= of_face / (2 * half[2]) * numbers(weight + 2 * CELL_POINTS) * phi;
+    CUDA_CALLABLE void add_mean_field(const CellPoints& all, int row, int k, Number phi, Vector& sums) const {
+        sums.x -= 1 / (2 * half[0]) * numbers(all.row(row, k)) * phi;
+        sums.y -= 1 / (2 * half[1]) * numbers(all.row(row + 1, k)) * phi;
+        sums.z -= 1 / (2 * half[2]) * numbers(all.row(row + 2, k)) * phi;
     }
     CUDA_CALLABLE Real3 to_world(Real3 v) const { return v.x * axes[0] + v.y * axes[1] + v.z * axes[2]; }
-    CUDA_CALLABLE bool is_outer(int face) const { return outer >> face & 1; }
+    // Axis across the ``number``-th outer face.
+    CUDA_CALLABLE int outer_axis(int number) const {
+        int face = 0;
+        for (int faces = outer; number > 0 || !(faces & 1); faces >>= 1, ++face) number -= faces & 1;
+        return face / 2;
+    }
 };
 template <class Arrays> CUDA_CALLABLE inline Cell cell_at(const Arrays& arrays, int c) {
     const auto& row = arrays.cells.cell.data[c]; // moment, body of its rotation, range of permanent bodies
     const int own = arrays.cells.row.data[c];
-    const auto& form = arrays.cells.form.data[own]; // bits of outer faces, index of its matrices
+    const auto& form = arrays.cells.form.data[own]; // bits of outer faces, index of its matrices, first point, points
     const Real* const half = arrays.cells.half.data + 3 * (size_t)own;
     const Real* const q = (const Real*)arrays.cells.rotation.data + 4 * (size_t)row[1];
     const Real* const grid = arrays.cells.grid.data + 9 * (size_t)row[1]; // axes of the grid in the body's frame
@@ -86,7 +92,9 @@ template <class Arrays> CUDA_CALLABLE inline Cell cell_at(const Arrays& arrays, 
                  row[2],
                  row[3],
                  form[0],
-                 arrays.cells.response.data + (size_t)form[1] * (3 * FACE_POINTS * FACE_POINTS)};
+                 arrays.cells.response.data + (size_t)form[1] * (3 * FACE_POINTS * FACE_POINTS),
+                 {arrays.cells.point.data + form[2], form[3], 0}};
+    for (int face = 0; face < 6; ++face) cell.fine.outer += form[0] >> face & 1 ? FACE_POINTS : 0;
     for (int a = 0; a < 3; ++a) {
         cell.axes[a] = grid[3 * a] * body.x + grid[3 * a + 1] * body.y + grid[3 * a + 2] * body.z;
         cell.size = cell.half[a] > Real(0.5) * cell.size ? 2 * cell.half[a] : cell.size;
@@ -184,12 +192,11 @@ CUDA_CALLABLE inline Real3 without_base(const Arrays& arrays, const Cell& cell, 
 }
 
 // Half the difference of a body's field between the halves of a cell along its axes, of the components along them.
-CUDA_CALLABLE inline Real3 coarse_differences(const Cell& cell, const Real* units, const PermanentBody& body,
+CUDA_CALLABLE inline Real3 coarse_differences(const Cell& cell, const CellPoints& coarse, const PermanentBody& body,
                                               const Real* cylinder) {
     Vector sums = zero_target_field().h;
-    const PointRange range = coarse_points();
-    for (int k = range.first + WIDTH * share(); k < range.last; k += WIDTH * SHARES)
-        cell.add_mean_field(units, 6, k, range.weight, outer_field(body, cylinder, cell.points(units, k)).phi, sums);
+    for (int k = WIDTH * share(); k < coarse.count; k += WIDTH * SHARES)
+        cell.add_mean_field(coarse, 6, k, outer_field(body, cylinder, cell.points(coarse, k)).phi, sums);
     return total_of(sums);
 }
 // Marks cell c as a far one unless a body is near it. A thread does this for one cell: most cells are far.
@@ -211,28 +218,27 @@ template <class Arrays> CUDA_CALLABLE inline void find_near_bodies(const Arrays&
 template <class Arrays> CUDA_CALLABLE inline void average_over_cell(const Arrays& arrays, int c) {
     if (!arrays.cells.near.data[c]) return;
     const Cell cell = cell_at(arrays, c);
-    const Real* const units = arrays.cells.point.data;
-    Real* const potential = arrays.cells.potential.data + OUTER_POINTS * (size_t)c;
+    const CellPoints& fine = cell.fine;
+    Real* const potential = arrays.cells.potential.data + MOST_OUTER * (size_t)c;
     Real3 field = {0, 0, 0}, acting = field, acting_mean = field, steepness = field;
     const Real3 correction = without_base(arrays, cell, arrays.targets.field);
     int nearness = FAR_CELL;
-    const PointRange range = fine_points();
     for (int b = cell.first; b < cell.last; ++b) {
         const PermanentBody body = body_at(arrays, b);
         const CellFades fade = cell_fades(cell, body);
         const bool acts = body.label != cell.label;
         const Real* const cylinder = cylinder_of(arrays, body);
         if (fade.coarse.weight > 0) {
-            steepness += fade.coarse.weight * coarse_differences(cell, units, body, cylinder);
+            steepness += fade.coarse.weight * coarse_differences(cell, coarse_points(arrays), body, cylinder);
             if (acts && nearness == FAR_CELL) nearness = STEEP_CELL;
         }
         if (fade.fine.weight == 0) continue;
         Vector means = zero_target_field().h, differences = means; // along the axes of the grid
-        for (int k = WIDTH * share(); k < range.last; k += WIDTH * SHARES) {
-            const Number phi = outer_field(body, cylinder, cell.points(units, k)).phi;
-            cell.add_mean_field(units, 3, k, range.weight, phi, means);
-            cell.add_mean_field(units, 6, k, range.weight, phi, differences);
-            if (acts && k < OUTER_POINTS)
+        for (int k = WIDTH * share(); k < fine.count; k += WIDTH * SHARES) {
+            const Number phi = outer_field(body, cylinder, cell.points(fine, k)).phi;
+            cell.add_mean_field(fine, 3, k, phi, means);
+            cell.add_mean_field(fine, 6, k, phi, differences);
+            if (acts && k < fine.outer)
                 put(potential + k, (nearness == NEAR_CELL ? numbers(potential + k) : 0 * phi) + fade.fine.weight * phi);
         }
         const Real3 average = cell.to_world(total_of(means));
@@ -245,8 +251,8 @@ template <class Arrays> CUDA_CALLABLE inline void average_over_cell(const Arrays
     if (nearness == NEAR_CELL) {
         const Vector along =
             broadcast({dot(acting_mean, cell.axes[0]), dot(acting_mean, cell.axes[1]), dot(acting_mean, cell.axes[2])});
-        for (int k = WIDTH * share(); k < OUTER_POINTS; k += WIDTH * SHARES)
-            put(potential + k, numbers(potential + k) + dot(along, cell.local_points(units, k)));
+        for (int k = WIDTH * share(); k < fine.outer; k += WIDTH * SHARES)
+            put(potential + k, numbers(potential + k) + dot(along, cell.local_points(k)));
     }
     if (share() != 0) return;
     arrays.cells.near.data[c] = nearness;
@@ -286,7 +292,7 @@ template <class Arrays> CUDA_CALLABLE inline void add_differences(const Arrays& 
 // Charges that respond to the potentials at points k and its successors of an outer face.
 CUDA_CALLABLE inline Number response_charges(const Cell& cell, const Real* potential, int k) {
     const int face = k / FACE_POINTS, point = k % FACE_POINTS;
-    const Real* const column = cell.matrices + face / 2 * (FACE_POINTS * FACE_POINTS) + point;
+    const Real* const column = cell.matrices + cell.outer_axis(face) * (FACE_POINTS * FACE_POINTS) + point;
     Number charge = Number(Real(0));
     for (int l = 0; l < FACE_POINTS; ++l)
         charge -= potential[face * FACE_POINTS + l] * numbers(column + l * FACE_POINTS);
@@ -294,10 +300,10 @@ CUDA_CALLABLE inline Number response_charges(const Cell& cell, const Real* poten
 }
 
 // Moment of these charges, along the axes of the grid.
-CUDA_CALLABLE inline Real3 response_moment(const Cell& cell, const Real* potential, const Real* units) {
+CUDA_CALLABLE inline Real3 response_moment(const Cell& cell, const Real* potential) {
     Vector sums = zero_target_field().h;
-    for (int k = WIDTH * share(); k < OUTER_POINTS; k += WIDTH * SHARES)
-        if (cell.is_outer(k / FACE_POINTS)) sums += response_charges(cell, potential, k) * cell.local_points(units, k);
+    for (int k = WIDTH * share(); k < cell.fine.outer; k += WIDTH * SHARES)
+        sums += response_charges(cell, potential, k) * cell.local_points(k);
     return total_of(sums);
 }
 
@@ -322,16 +328,13 @@ CUDA_CALLABLE inline Real3 moment_differences(const Arrays& arrays, const Cell& 
 }
 // Wrench/μ0 of a body on the charges of a cell by its moment, differences and response, at fine or coarse points.
 CUDA_CALLABLE inline Wrench wrench_on_charges(const Cell& cell, const PermanentBody& body, const Real* cylinder,
-                                              const Real* units, PointRange range, Real3 m, Real3 difference,
-                                              const Real* potential) {
+                                              const CellPoints& all, Real3 m, Real3 difference, const Real* potential) {
     Wrench wrench = zero_wrench();
-    for (int k = range.first + WIDTH * share(); k < range.last; k += WIDTH * SHARES) {
-        const Vector x = cell.points(units, k);
+    for (int k = WIDTH * share(); k < all.count; k += WIDTH * SHARES) {
+        const Vector x = cell.points(all, k);
         const PotentialField at_points = outer_field(body, cylinder, x);
-        Number charge =
-            cell.charges(units, 3, k, range.weight, m) + cell.charges(units, 6, k, range.weight, difference);
-        if (potential != nullptr && k < OUTER_POINTS && cell.is_outer(k / FACE_POINTS))
-            charge += response_charges(cell, potential, k);
+        Number charge = cell.charges(all, 3, k, m) + cell.charges(all, 6, k, difference);
+        if (k < all.outer) charge += response_charges(cell, potential, k);
         const Vector f = charge * at_points.h;
         wrench.force += f;
         wrench.torque += cross(x - broadcast(cell.center), f);
@@ -346,7 +349,6 @@ CUDA_CALLABLE inline void add_cell_wrench(const Arrays& arrays, const Cell& cell
     const PermanentBody body = body_at(arrays, b);
     const CellFades fade = cell_fades(cell, body);
     if ((fade.fine.weight == 0 && fade.coarse.weight == 0) || body.label == cell.label) return;
-    const Real* const units = arrays.cells.point.data;
     const Real* const cylinder = cylinder_of(arrays, body);
     const Real3 m = effective_at(arrays.effective.data, arrays.effective.strides[0] / sizeof(Real), cell.moment);
     const Real3 difference = moment_differences(arrays, cell, c, m);
@@ -355,15 +357,14 @@ CUDA_CALLABLE inline void add_cell_wrench(const Arrays& arrays, const Cell& cell
         torque += by.weight * t;
     };
     if (fade.coarse.weight > 0) {
-        const Wrench w =
-            wrench_on_charges(cell, body, cylinder, units, coarse_points(), {0, 0, 0}, difference, nullptr);
+        const Wrench w = wrench_on_charges(cell, body, cylinder, coarse_points(arrays), {0, 0, 0}, difference, nullptr);
         add(fade.coarse, total_of(w.force), total_of(w.torque), total_of(w.energy));
     }
     if (fade.fine.weight == 0) return;
     const Real3 along = {dot(m, cell.axes[0]), dot(m, cell.axes[1]), dot(m, cell.axes[2])};
-    const Real* const potential = arrays.cells.potential.data + OUTER_POINTS * (size_t)c;
-    const Real3 responding = along - response_moment(cell, potential, units); // potentials lack the average field
-    const Wrench w = wrench_on_charges(cell, body, cylinder, units, fine_points(), responding, difference, potential);
+    const Real* const potential = arrays.cells.potential.data + MOST_OUTER * (size_t)c;
+    const Real3 responding = along - response_moment(cell, potential); // potentials lack the average field
+    const Wrench w = wrench_on_charges(cell, body, cylinder, cell.fine, responding, difference, potential);
     const Real3 change = real3((const Real*)arrays.cells.change.data + 3 * (size_t)c);
     const Real3 correction = without_base(arrays, cell, arrays.targets.acting) - change;
     const TargetField at_center = center_field(arrays, cell, b, body, correction);

@@ -18,8 +18,8 @@ from warpmag.kernels.shared.reductions import most_blocks
 
 FACE_SPLIT = 4  # squares along each side of a face
 FACE_POINTS = FACE_SPLIT**2  # points of a face; as in ``near_cells.h``
-MIDDLE_POINTS = 16  # four points on each plane through the middle of a cell, and padding; as in ``near_cells.h``
 COARSE_POINTS = 16  # points of a cell for differences at a distance, and padding; as in ``near_cells.h``
+_WIDEST = 16  # numbers of points are multiples of it, the longest vector of a CPU
 NEAR = 2  # value of ``near`` of cells over which fields are averaged; as in ``near_cells.h``
 CELL_REACH = 0.75, 1.25
 """Distances from a body's box at which averages start to turn into the field at the center, and are it, in longest
@@ -45,7 +45,8 @@ def cell_arrays_type(dtype):
     @wp.struct
     class CellArrays:
         # Cells of a shape, of all shapes one after the other, shape [rows]:
-        form: wp.array[wp.vec2i]  # bits of the faces on the body's surface (−x, +x, −y, ...), index of its matrices
+        form: wp.array[wp.vec4i]  # bits of the faces on the body's surface (−x, +x, −y, ...), index of its matrices,
+        # first number of its fine points in ``point``, number of these points
         half: wp.array2d[dtype]  # half sides [m], shape [rows, 3]
         neighbor: wp.array2d[int]  # index of the neighbor on each side, less that of the cell, shape [rows, 6]
         weight: wp.array2d[dtype]  # weights of a cell and of its neighbors in its differences, shape [rows, 12]
@@ -60,7 +61,7 @@ def cell_arrays_type(dtype):
         grid: wp.array2d[dtype]  # axes of the grid in the body's frame, shape [bodies, 9]
         # Tables:
         response: wp.array[dtype]  # R [m] of faces across x, y and z, shape [kinds, 3, FACE_POINTS, FACE_POINTS]
-        point: wp.array[dtype]  # points of a cell and charges at them (:func:`unit_points`), shape [9, points]
+        point: wp.array[dtype]  # coarse points of a cell, then the fine points of all kinds of outer faces
         cylinder: wp.array[int]  # first number in ``cylinders`` of each permanent shape, -1 for polyhedra
         cylinders: wp.array[dtype]  # places and tables of cylinders (``cylinder.h``)
         # Moments, shape [n]:
@@ -75,38 +76,51 @@ def cell_arrays_type(dtype):
             dtype
         ]  # force/μ0 and torque/μ0 of a source that is the only one [A²], [A² m], shape [cells, 6]
         near: wp.array[int]  # how near a body is that acts on a cell: 0, 1 for differences, NEAR, shape [cells]
-        potential: wp.array[dtype]  # potential of these bodies at the points, faded [A], shape [cells, 6 FACE_POINTS]
+        potential: wp.array[
+            dtype
+        ]  # potential of these bodies at points of outer faces [A], shape [cells · 6 FACE_POINTS]
 
     return CellArrays
 
 
-def unit_points() -> np.ndarray:
-    """Return the points of a cell and the charges at them, shape [9, 6 FACE_POINTS + MIDDLE_POINTS + COARSE_POINTS].
+def coarse_points() -> np.ndarray:
+    """Return points of a cell for differences at a distance: the centers of its faces, and of itself.
 
-    Rows are the positions in a cube of half side 1, the charges by moments along the axes, and those by differences
-    of the halves along the axes. The fine points are those of the faces −x, +x, −y, ..., and Gauss points of the planes
-    x, y, z = 0; their charges have weights 1/FACE_POINTS. The coarse points are the centers of the faces, and of the
-    cell. The potential varies less over the planes than over the faces.
+    Rows are the positions in a cube of half side 1, the charges by moments along the axes, which are 0 here, and those
+    by differences of the halves along the axes, shape [9, COARSE_POINTS].
     """
-    middles = (2.0 * np.arange(FACE_SPLIT) + 1.0) / FACE_SPLIT - 1.0
-    of_face, of_plane = (
-        [values.ravel() for values in np.meshgrid(line, line, indexing="ij")]
-        for line in (middles, np.array([-1.0, 1.0]) / np.sqrt(3.0))
-    )
-    fine, middle, coarse = np.zeros((9, 6, FACE_POINTS)), np.zeros((9, MIDDLE_POINTS)), np.zeros((9, COARSE_POINTS))
+    points = np.zeros((9, COARSE_POINTS))
     for face in range(6):
-        axis, height = face // 2, 2.0 * (face % 2) - 1.0
-        first, second = (k for k in range(3) if k != axis)
-        fine[axis, face], fine[first, face], fine[second, face] = height, *of_face
-        fine[3 + axis, face], fine[6 + axis, face] = height, 1.0
-        coarse[axis, face], coarse[6 + axis, face] = height, 1.0
-    for axis in range(3):
-        first, second = (k for k in range(3) if k != axis)
-        points = slice(4 * axis, 4 * axis + 4)
-        middle[first, points], middle[second, points] = of_plane
-        middle[6 + axis, points] = -2.0 * FACE_POINTS / 4.0
-        coarse[6 + axis, 6] = -2.0
-    return np.concatenate([fine.reshape(9, -1), middle, coarse], axis=1)
+        axis = face // 2
+        points[axis, face], points[6 + axis, face] = 2.0 * (face % 2) - 1.0, 1.0
+        points[6 + axis, 6] = -2.0
+    return points
+
+
+def fine_points(outer: int) -> np.ndarray:
+    """Return points of a cell near a magnet, with rows as those of :func:`coarse_points`, shape [9, points].
+
+    ``outer`` has a bit for each face on the body's surface (−x, +x, −y, ...). These faces come first, with the middles
+    of FACE_POINTS squares, where charges respond. The other faces, and the planes x, y, z = 0, have four Gauss points:
+    they are further from magnets, or the potential varies less over them.
+    """
+    middles, gauss = (2.0 * np.arange(FACE_SPLIT) + 1.0) / FACE_SPLIT - 1.0, np.array([-1.0, 1.0]) / np.sqrt(3.0)
+    faces = sorted(range(6), key=lambda face: not outer >> face & 1)
+    blocks = [_square(face // 2, 2.0 * (face % 2) - 1.0, middles if outer >> face & 1 else gauss) for face in faces]
+    blocks += [_square(axis, 0.0, gauss) for axis in range(3)]
+    points = np.concatenate(blocks, axis=1)
+    return np.pad(points, ((0, 0), (0, -points.shape[1] % _WIDEST)))
+
+
+def _square(axis: int, height: float, line: np.ndarray) -> np.ndarray:
+    """Return points across an axis, on the squares of ``line``, and their charges; those of the middle are −2."""
+    count = len(line) ** 2
+    points = np.zeros((9, count))
+    first, second = (k for k in range(3) if k != axis)
+    points[axis] = height
+    points[first], points[second] = (values.ravel() for values in np.meshgrid(line, line, indexing="ij"))
+    points[3 + axis], points[6 + axis] = height / count, (1.0 if height else -2.0) / count
+    return points
 
 
 def _axes(rotation: np.ndarray) -> np.ndarray:
@@ -118,16 +132,31 @@ def _axes(rotation: np.ndarray) -> np.ndarray:
 
 
 def _table(coupling, kind: int, scalar) -> dict[str, np.ndarray]:
-    """Return the rows of the cells of the ``kind``-th shape, by the names of arrays in :func:`cell_arrays_type`."""
+    """Return the rows of the cells of the ``kind``-th shape, by the names of arrays in :func:`cell_arrays_type`.
+
+    The columns of ``form`` that refer to points are still 0.
+    """
     count = len(coupling.radii)
-    bits = coupling.outer_faces @ (1 << np.arange(6))
+    bits, zeros = coupling.outer_faces @ (1 << np.arange(6)), np.zeros(count)
     return {
-        "form": np.column_stack([bits, np.full(count, kind)]).astype(np.int32),
+        "form": np.column_stack([bits, np.full(count, kind), zeros, zeros]).astype(np.int32),
         "half": coupling.half_sides.astype(scalar),
         "neighbor": (coupling.neighbor - np.arange(count)[:, None]).astype(np.int32),
         "weight": coupling.weights.astype(scalar),
         "layer": coupling.layer.astype(scalar),
     }
+
+
+def _points_of(tables: Sequence[dict[str, np.ndarray]]) -> np.ndarray:
+    """Return the coarse points, then the fine points of each kind of outer faces, and refer to them in the forms."""
+    parts, first = [coarse_points()], 9 * COARSE_POINTS
+    forms = [table["form"] for table in tables]
+    for outer in np.unique(np.concatenate([form[:, 0] for form in forms])):
+        parts.append(fine_points(int(outer)))
+        for form in forms:
+            form[form[:, 0] == outer, 2:] = first, parts[-1].shape[1]
+        first += parts[-1].size
+    return np.concatenate([part.ravel() for part in parts])
 
 
 def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solids, solid_ranges, dtype, device, copies=1):
@@ -161,7 +190,8 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solids, so
     tables = [_table(body.coupling, k, wp.dtype_to_numpy(dtype)) for k, body in enumerate(shapes)]
     sizes = np.array([len(table["form"]) for table in tables])
     counts, begins = sizes[kind], (np.cumsum(sizes) - sizes)[kind]
-    types = {"form": wp.vec2i, "half": dtype, "neighbor": wp.int32, "weight": dtype, "layer": dtype}
+    points = _points_of(tables)
+    types = {"form": wp.vec4i, "half": dtype, "neighbor": wp.int32, "weight": dtype, "layer": dtype}
     for name, warp_type in types.items():
         setattr(arrays, name, put(np.concatenate([table[name] for table in tables]), warp_type))
     firsts = np.array([body.first for body in used])
@@ -174,7 +204,7 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solids, so
     grids = np.zeros((len(bodies), 9))
     grids[numbers] = np.array([_axes(body.coupling.grid_rotation) for body in shapes])[kind]
     arrays.grid, arrays.rotation = put(repeat_rows(grids, copies), dtype), rotations
-    arrays.point = put(unit_points().ravel(), dtype)
+    arrays.point = put(points, dtype)
     arrays.response = put(np.concatenate([body.response.ravel() for body in shapes]), dtype)
     potentials = [
         solid.shape.potential_table() if solid.potential is None else solid.potential
@@ -242,9 +272,12 @@ def energies(arrays) -> np.ndarray:
     """Return the energies over μ0 of the charges on the faces of cells, −½ φᵀ R φ, shape [cells]."""
     near = np.flatnonzero(arrays.near.numpy() == NEAR)
     forms, factors = arrays.form.numpy()[arrays.row.numpy()[near]], arrays.factor.numpy()[near].astype(float)
-    potentials = arrays.potential.numpy().reshape(-1, 6, FACE_POINTS)[near].astype(float)
+    potentials = arrays.potential.numpy().reshape(-1, 6, FACE_POINTS)[near]
     matrices = arrays.response.numpy().reshape(-1, 3, FACE_POINTS, FACE_POINTS)[forms[:, 1]].astype(float)
-    of_faces = np.einsum("cfi,cfij,cfj->cf", potentials, np.repeat(matrices, 2, axis=1), potentials)
+    is_outer = (forms[:, :1] >> np.arange(6) & 1).astype(bool)
+    place = np.where(is_outer, np.cumsum(is_outer, axis=1) - 1, 0)  # outer faces come first in ``potential``
+    of_faces = np.take_along_axis(potentials, place[:, :, None], axis=1)
+    of_faces = np.where(is_outer[:, :, None], of_faces, 0).astype(float)  # the rest was never written
     result = np.zeros(len(arrays.near))
-    result[near] = -0.5 * factors * (of_faces * (forms[:, :1] >> np.arange(6) & 1)).sum(axis=1)
+    result[near] = -0.5 * factors * np.einsum("cfi,cfij,cfj->c", of_faces, np.repeat(matrices, 2, axis=1), of_faces)
     return result
