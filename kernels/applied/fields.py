@@ -21,6 +21,7 @@ from warpmag.kernels.applied.sources import FieldSources, SourceKind, source_arr
 from warpmag.kernels.pairs.pair_law import INVERSE_4PI
 from warpmag.kernels.pairs.wrench import MU0
 from warpmag.kernels.shared.copies import put_copies, repeat_rows
+from warpmag.kernels.shared.launches import RecordedLaunches
 from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.pieces import cut
 from warpmag.kernels.shared.reductions import group_threads, most_blocks
@@ -253,7 +254,7 @@ class AppliedForces(AppliedField):
             self._lay_out_balls(ball_indices)
         source_of_moment, solids = np.full(len(self._worlds), -1), self.sources.solids_of_copy
         source_of_moment[[solid.first for solid in solids]] = len(sources.applied) + np.arange(len(solids))
-        self._moves = bool(np.any(movable))
+        self._moves, self._launch = bool(np.any(movable)), RecordedLaunches()
         self._fine_tables: dict[str, wp.array] | None = None
         self.movable = self._in_copies(np.asarray(movable, bool))
         self._source = self._in_copies(source_of_moment, len(solids))
@@ -373,7 +374,7 @@ class AppliedForces(AppliedField):
     def write_image_factors(self, moments, radii, material):
         """Launch :func:`near_cells.launch_image_factors` if there are cells."""
         if self.cell_count:
-            near_cells.launch_image_factors(self.arrays.cells, moments, radii, material)
+            near_cells.launch_image_factors(self._launch, self.arrays.cells, moments, radii, material)
 
     def add(self, effective, forces, torques, response=None):
         """Add the forces on moments and between bodies near each other, and sum the reactions.
@@ -394,7 +395,7 @@ class AppliedForces(AppliedField):
             return
         inputs = [self.movable, self._source, effective, *self.along, self.wrenches]
         kernel = _force_kernel(self.sources.dtype)
-        wp.launch(kernel, self.count, inputs=inputs, outputs=[forces, torques], device=self.device)
+        self._launch(kernel, self.count, inputs=inputs, outputs=[forces, torques], device=self.device)
 
     def energies(self) -> np.ndarray:
         """Return the energy of permanent bodies near each other or near cells, less that of moments [J], shape [n].

@@ -253,10 +253,11 @@ def _image_factor_kernel(dtype):
     return write_image_factors
 
 
-def launch_image_factors(arrays, moments, radii, material):
+def launch_image_factors(launch, arrays, moments, radii, material):
     """Write the factor (μ − 1)/(μ + 1) of the charges on faces of near cells, for their differential permeability μ.
 
     Args:
+        launch: The ``RecordedLaunches`` of the caller.
         arrays: The struct of :func:`cell_arrays_type`.
         moments: Moments [A·m²], shape [n].
         radii: Radii of their balls [m], shape [n].
@@ -265,7 +266,7 @@ def launch_image_factors(arrays, moments, radii, material):
     values = moments, radii, material.saturation, material.slope, material.curve, material.tables
     kernel = _image_factor_kernel(arrays.factor.dtype)
     most = most_blocks(moments.device) if arrays.active else 0
-    wp.launch(kernel, arrays.cell.shape[0], inputs=[*values, arrays], max_blocks=most, device=moments.device)
+    launch(kernel, arrays.cell.shape[0], inputs=[*values, arrays], max_blocks=most, device=moments.device)
 
 
 def energies(arrays) -> np.ndarray:

@@ -20,6 +20,7 @@ import warp as wp
 
 from warpmag.kernels.pairs import neighbors
 from warpmag.kernels.pairs.wrench import MU0
+from warpmag.kernels.shared.launches import RecordedLaunches
 from warpmag.kernels.shared.native import CHUNK, LINE, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes, threads_for
@@ -272,6 +273,7 @@ class CellPairs:
         def zeros(*shape, kind=wp.int32):
             return wp.zeros(shape, dtype=kind, device=device)
 
+        self._launch = RecordedLaunches()
         self._lists = lists = neighbors.allocate(
             n, packed.packed, put(group), reach=reach, ratio=ratio, capacity=capacity,
             radii=put(0.5 * half[3], dtype), bodies=body,
@@ -330,7 +332,7 @@ class CellPairs:
         self.arrays.displaced.zero_()
         for launch in self._locate:
             launch.launch()
-        neighbors.launch_find_neighbors(self._lists, self._lists)
+        neighbors.launch_find_neighbors(self._lists, self._lists, self._launch)
         for launch in self._tabulate:
             launch.launch()
 

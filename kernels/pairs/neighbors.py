@@ -123,7 +123,7 @@ def _kernel(call: str, header: str, dtype, capacity: int, group: int):
     return native_kernel(call, header, arguments, dtype=dtype, CAPACITY=capacity, GROUP=group, BLOCK=_BLOCK)
 
 
-def _launch(call: str, targets, sources, dim: int = 1, most: int = 0):
+def _launch(launch, call: str, targets, sources, dim: int = 1, most: int = 0):
     """Launch ``dim`` threads that make a call of the device's header; on a CPU one thread shares it with the team.
 
     At most ``most`` blocks make several calls in each thread; 0 means that each thread makes one call.
@@ -135,30 +135,30 @@ def _launch(call: str, targets, sources, dim: int = 1, most: int = 0):
         threads = threads_for(targets.packed.shape[1], MOMENTS_PER_THREAD)
     kernel = _kernel(call, header, targets.packed.dtype, targets.neighbor.shape[1], group_threads(device))
     options = {"device": device, "block_dim": _BLOCK, "max_blocks": most}
-    wp.launch(kernel, dim=dim, inputs=[threads, members, targets, sources], **options)
+    launch(kernel, dim, inputs=[threads, members, targets, sources], **options)
 
 
-def launch_find_neighbors(targets, sources):
+def launch_find_neighbors(targets, sources, launch=wp.launch):
     """List the sources near each target, if a target has moved too far since the last search.
 
     ``targets`` holds the reach of both sets, ``sources`` the hash table. If both are the same, a moment is not its own
-    neighbor.
+    neighbor. ``launch`` is ``wp.launch``, or the ``RecordedLaunches`` of these lists.
     """
     if targets.packed.device.is_cpu:
-        _launch("search_neighbors(targets, sources, threads, team.data)", targets, sources)
+        _launch(launch, "search_neighbors(targets, sources, threads, team.data)", targets, sources)
         return
-    _launch("fill_table(thread, targets, sources)", targets, sources, max(sources.packed.shape[1], 1))
+    _launch(launch, "fill_table(thread, targets, sources)", targets, sources, max(sources.packed.shape[1], 1))
     # in most steps nothing has moved too far, and a block for each four targets would only start and end
     dim, most = 32 * targets.packed.shape[1], most_blocks(targets.packed.device)
-    _launch("list_neighbors(thread, targets, sources)", targets, sources, dim, most)
+    _launch(launch, "list_neighbors(thread, targets, sources)", targets, sources, dim, most)
 
 
-def launch_list_overlaps(targets, sources):
-    """List the neighbors of each target that overlap it."""
+def launch_list_overlaps(targets, sources, launch):
+    """List the neighbors of each target that overlap it, by the ``RecordedLaunches`` of these lists."""
     if targets.overlap is targets.neighbor:
         return
     if targets.packed.device.is_cpu:
-        _launch("list_overlaps_of_all(targets, sources, threads, team.data)", targets, sources)
+        _launch(launch, "list_overlaps_of_all(targets, sources, threads, team.data)", targets, sources)
     else:
         dim = group_threads(targets.packed.device) * targets.packed.shape[1]
-        _launch("list_overlaps(targets, sources, thread / warpmag::GROUP)", targets, sources, dim)
+        _launch(launch, "list_overlaps(targets, sources, thread / warpmag::GROUP)", targets, sources, dim)

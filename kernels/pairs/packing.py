@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.pairs import neighbors
+from warpmag.kernels.shared.launches import RecordedLaunches
 
 PACKED_ROWS = 8
 PITCH = 128
@@ -97,6 +98,7 @@ class PackedMoments:
         device, dtype, n = radii.device, radii.dtype, radii.shape[0]
         self.count, self.device, self.dtype = n, device, dtype
         self.radii, self.largest_radius, self._moving = radii, largest_radius, moving
+        self._launch = RecordedLaunches()
 
         def integers(values):
             is_array = isinstance(values, wp.array)
@@ -126,6 +128,7 @@ class PackedMoments:
         Both share the lists of overlapping moments, for moments at the same positions. Each is packed on its own.
         """
         twin = copy(self)
+        twin._launch = RecordedLaunches()
         pitched = wp.clone(self._whole)
         twin._whole, twin.labels = pitched, self.labels if labels is None else labels
         twin.packed = pitched[:, : self.count] if self.count else pitched
@@ -150,7 +153,7 @@ class PackedMoments:
             groups = self.groups if resting else self.active_groups
             inputs = [positions, moments, self.radii, self.labels, groups, self._lists.found_at]
             outputs = [self.packed, self._lists.moved]
-            wp.launch(_pack_kernel(self.dtype), self.count, inputs=inputs, outputs=outputs, device=self.device)
+            self._launch(_pack_kernel(self.dtype), self.count, inputs=inputs, outputs=outputs, device=self.device)
 
     def find_overlaps(self, sources: "PackedMoments | None" = None):
         """List the ``sources`` that overlap each of these moments; None means these moments themselves."""
@@ -163,8 +166,8 @@ class PackedMoments:
             self._lists.moved.fill_(1)  # ``pack`` detects motion of these moments only
         if sources is not self:
             self._lists.reach.fill_(reach)
-        neighbors.launch_find_neighbors(self._lists, sources._lists)
-        neighbors.launch_list_overlaps(self._lists, sources._lists)
+        neighbors.launch_find_neighbors(self._lists, sources._lists, self._launch)
+        neighbors.launch_list_overlaps(self._lists, sources._lists, self._launch)
 
 
 @cache

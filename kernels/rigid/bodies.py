@@ -91,7 +91,7 @@ def _gather_moments(
 
 
 def gather_moments(
-    body_q, magnets: BodyMoments, present: ShapeMagnets, initial: ShapeMagnets, positions, moments, changed
+    launch, body_q, magnets: BodyMoments, present: ShapeMagnets, initial: ShapeMagnets, positions, moments, changed
 ):
     """Write the positions of all moments and the moments of permanent magnets, in the world's frame.
 
@@ -99,7 +99,7 @@ def gather_moments(
     """
     inputs, outputs = [body_q, magnets, present, initial], [positions, moments, changed]
     dim = max(len(positions), len(present.kind))
-    wp.launch(_gather_moments, dim, inputs=inputs, outputs=outputs, device=positions.device)
+    launch(_gather_moments, dim, inputs=inputs, outputs=outputs, device=positions.device)
 
 
 @wp.kernel
@@ -118,11 +118,11 @@ def _gather_bias(
     bias_out[i] = wp.transform_vector(frame, wp.transform_vector(magnets.shape_frames[shape], bias))
 
 
-def gather_bias(body_q, magnets: BodyMoments, moments, factors, bias):
+def gather_bias(launch, body_q, magnets: BodyMoments, moments, factors, bias):
     """Write the bias field of ``moments`` with a remanence, ``factors`` times their magnetization [A/m], world
     frame."""
     inputs = [body_q, magnets, moments, factors]
-    wp.launch(_gather_bias, len(moments), inputs=inputs, outputs=[bias], device=bias.device)
+    launch(_gather_bias, len(moments), inputs=inputs, outputs=[bias], device=bias.device)
 
 
 @wp.kernel
@@ -134,9 +134,9 @@ def _gather_rotations(
         rotations_out[k] = wp.transform_get_rotation(body_q_in[bodies_in[k]])
 
 
-def gather_rotations(body_q, bodies, rotations):
+def gather_rotations(launch, body_q, bodies, rotations):
     """Write the rotations of ``bodies``, except for index −1, the world."""
-    wp.launch(_gather_rotations, len(bodies), [body_q, bodies], [rotations], device=rotations.device)
+    launch(_gather_rotations, len(bodies), [body_q, bodies], [rotations], device=rotations.device)
 
 
 @wp.kernel
@@ -148,9 +148,9 @@ def _gather_frames(
         frames_out[k] = body_q_in[bodies_in[k]]
 
 
-def gather_frames(body_q, bodies, frames):
+def gather_frames(launch, body_q, bodies, frames):
     """Write the poses of ``bodies``, except for index −1, the world."""
-    wp.launch(_gather_frames, len(bodies), [body_q, bodies], [frames], device=frames.device)
+    launch(_gather_frames, len(bodies), [body_q, bodies], [frames], device=frames.device)
 
 
 @wp.kernel
@@ -223,12 +223,12 @@ def _add_wrenches(
         body_f_out[body] = body_f_out[body] + wp.spatial_vector(force, torque)
 
 
-def add_wrenches(magnets: BodyMoments, model, state, positions, forces, torques):
+def add_wrenches(launch, magnets: BodyMoments, model, state, positions, forces, torques):
     """Add force and torque of every moment to its body in ``state``, but for kinematic bodies and resting worlds."""
     device = positions.device
     threads = _THREADS if device.is_cuda else 1
     inputs = [magnets, state.body_q, model.body_com, model.body_flags, positions, forces, torques, threads]
-    wp.launch(_add_wrenches, threads * len(magnets.body_list), inputs=inputs, outputs=[state.body_f], device=device)
+    launch(_add_wrenches, threads * len(magnets.body_list), inputs=inputs, outputs=[state.body_f], device=device)
 
 
 @wp.kernel

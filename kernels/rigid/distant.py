@@ -11,6 +11,7 @@ import warp as wp
 
 from warpmag.kernels.rigid.bodies import BodyMoments
 from warpmag.kernels.rigid.newton_views import body_pose
+from warpmag.kernels.shared.launches import RecordedLaunches
 
 wp.set_module_options({"enable_backward": False})
 
@@ -231,6 +232,7 @@ class DistantLaunches:
         """Record the launches that need no poses."""
         self._bodies, self._choice, self._magnets, self._systems = bodies, choice, magnets, systems
         self._device, worlds = choice.level.device, len(choice.level)
+        self._launch = RecordedLaunches()
         levels, cells = list(zip(bodies, systems, strict=False)), systems[-1]
 
         def record(kernel, dim, *inputs):
@@ -259,7 +261,7 @@ class DistantLaunches:
         self._begin.launch()
         threads, bodies = _THREADS if self._device.is_cuda else 1, self._bodies[0]
         inputs = [body_q, bodies, self._systems[0], threads, self._choice]
-        wp.launch(_measure_distances, threads * len(bodies.body), inputs=inputs, device=self._device)
+        self._launch(_measure_distances, threads * len(bodies.body), inputs=inputs, device=self._device)
         self._choose[allowed].launch()
         for launch in self._let_act:
             launch.launch()
@@ -290,4 +292,4 @@ class DistantLaunches:
         for bodies, few, find_strengths in zip(self._bodies, self._systems, self._find_strengths, strict=False):
             find_strengths.launch()
             inputs = [body_q, self._magnets, bodies, few, cells]
-            wp.launch(_spread_moments, len(cells.moments), inputs=inputs, device=self._device)
+            self._launch(_spread_moments, len(cells.moments), inputs=inputs, device=self._device)

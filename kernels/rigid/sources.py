@@ -42,9 +42,9 @@ def _gather_sources(
     strengths_out[s] = wp.vec3(sources.strengths[shape], 0.0, 0.0)
 
 
-def gather_sources(body_q, sources: SourceShapes, frames, strengths):
+def gather_sources(launch, body_q, sources: SourceShapes, frames, strengths):
     """Write the frames of all sources in the world, and their strengths."""
-    wp.launch(_gather_sources, len(frames), [body_q, sources], [frames, strengths], device=frames.device)
+    launch(_gather_sources, len(frames), [body_q, sources], [frames, strengths], device=frames.device)
 
 
 @wp.kernel
@@ -92,10 +92,10 @@ def _add_reactions(
     body_f_out[body] = body_f_out[body] + wp.spatial_vector(force, torque)
 
 
-def add_reactions(sources: SourceShapes, model, state, frames, wrenches):
+def add_reactions(launch, sources: SourceShapes, model, state, frames, wrenches):
     """Add the wrench of each source, about its frame's origin, to that of its body, except for kinematic bodies."""
     inputs = [sources, view_bodies(model, state), frames, wrenches]
-    wp.launch(_add_reactions, len(sources.body_list), inputs, [state.body_f], device=frames.device)
+    launch(_add_reactions, len(sources.body_list), inputs, [state.body_f], device=frames.device)
 
 
 @wp.kernel

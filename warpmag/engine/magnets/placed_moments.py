@@ -18,6 +18,7 @@ from warpmag.kernels.rigid.bodies import (
     gather_rotations,
 )
 from warpmag.kernels.shared.copies import put_copies
+from warpmag.kernels.shared.launches import RecordedLaunches
 
 
 class PlacedMoments:
@@ -35,7 +36,7 @@ class PlacedMoments:
 
     def __init__(self, model: newton.Model, worlds: EqualWorlds, settings, **options):
         """Make the system of the moments of all magnets; see :func:`make_system` for the other arguments."""
-        self.worlds, self._device = worlds, model.device
+        self.worlds, self._device, self._launch = worlds, model.device, RecordedLaunches()
         self.system = make_system(model, worlds, settings, **options)
         lattices = [magnet.lattice for magnet in worlds.magnets]
         counts = [len(lattice.volumes) for lattice in lattices]
@@ -88,20 +89,22 @@ class PlacedMoments:
     def gather(self, body_q: wp.array, values: ModelValues) -> None:
         """Write positions, rotations and permanent moments at the poses ``body_q`` to the system."""
         system, table = self.system, self.table
-        gather_moments(body_q, table, values.present, values.used, system.positions, system.moments, values.changed)
+        gather_moments(
+            self._launch, body_q, table, values.present, values.used, system.positions, system.moments, values.changed
+        )
         self.gather_frames(body_q)
         if len(self.recoiling):
-            gather_bias(body_q, table, self.recoiling, self._bias_factors, system.bias)
+            gather_bias(self._launch, body_q, table, self.recoiling, self._bias_factors, system.bias)
 
     def gather_frames(self, body_q: wp.array) -> None:
         """Write rotations of bodies of cells and frames of permanent bodies at the poses ``body_q`` to the system."""
         system = self.system
         if system.rotations is not None:
-            gather_rotations(body_q, self.coupled_bodies, system.rotations)
+            gather_rotations(self._launch, body_q, self.coupled_bodies, system.rotations)
         if len(self.solid_bodies):
-            gather_frames(body_q, self.solid_bodies, system.sources.solid_frames)
+            gather_frames(self._launch, body_q, self.solid_bodies, system.sources.solid_frames)
 
     def add_wrenches(self, model: newton.Model, state: newton.State) -> None:
         """Add the forces that the system computed to ``state.body_f``, but not in worlds where it rests."""
         system = self.system
-        add_wrenches(self.table, model, state, system.positions, system.forces, system.torques)
+        add_wrenches(self._launch, self.table, model, state, system.positions, system.forces, system.torques)

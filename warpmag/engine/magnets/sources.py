@@ -22,6 +22,7 @@ from warpmag.kernels.rigid.sources import (
     gather_sources,
     set_strengths,
 )
+from warpmag.kernels.shared.launches import RecordedLaunches
 from warpmag.moments.arrays import check_warp_array, host_array
 from warpmag.moments.system import MomentSystem
 
@@ -40,7 +41,7 @@ class ModelSources:
 
     def __init__(self, model: newton.Model, magnet_worlds: np.ndarray):
         """Read the sources from the attributes of the model; ``magnet_worlds`` are the worlds of ``find_magnets``."""
-        self._model, self._matches = model, {}
+        self._model, self._matches, self._launch = model, {}, RecordedLaunches()
         texts = getattr(getattr(model, NAMESPACE, None), "source", ())
         self.shapes, self.applied, self._records = [], [], []
         bodies, worlds, flags = model.shape_body.numpy(), model.shape_world.numpy(), model.body_flags
@@ -84,7 +85,9 @@ class ModelSources:
     def gather(self, body_q) -> None:
         """Write the frames and the strengths of the sources to the system."""
         if self.applied:
-            gather_sources(body_q, self.on_device, self._system.sources.frames, self._system.sources.strengths)
+            gather_sources(
+                self._launch, body_q, self.on_device, self._system.sources.frames, self._system.sources.strengths
+            )
 
     def gather_motion(self, state: newton.State, motion) -> None:
         """Write the velocities of the sources, shape [sources, 6] (``kernels.applied.sources``)."""
@@ -95,7 +98,7 @@ class ModelSources:
         """Add the forces of the moments on the sources to the forces on their bodies."""
         if self.applied:
             frames, wrenches = self._system.sources.frames, self._system.source_interaction.wrenches
-            add_reactions(self.on_device, self._model, state, frames, wrenches)
+            add_reactions(self._launch, self.on_device, self._model, state, frames, wrenches)
 
     def set_strength(self, name: str, selector: int | str, value) -> None:
         """Set the strengths of the sources that match a shape index or a shell pattern of labels.
