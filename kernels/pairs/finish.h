@@ -100,7 +100,7 @@ CUDA_CALLABLE inline void add_overlaps(Vector& h, Vector& f, Vector e, const Arr
         Mask active = listed & (dot(r, r) < contact * contact);
         if (Q != Quantity::FIELD) active &= label != sources.number(7, j);
         else if (arrays.same_set) active &= mask_of(j != at.i);
-        if (WIDTH == 1 && !any(active)) return;
+        if (!any(active)) return;
         const Vector m = sources.vector(4, j);
         auto pair = [&] { return overlap_of(r, radius, other_radius, m, active); };
         if (Q != Quantity::FIELD) add_where(active, f, force_of(pair(), e));

@@ -60,13 +60,16 @@ CUDA_CALLABLE inline Number shared_volumes(const Lists& lists, int i, int lane_c
 #if !defined(__CUDA_ARCH__)
     for (int l = 0; l < WIDTH; ++l) self[l] += l;
 #endif
-    auto row = [&](int c, Index j) { return collect(packed + c * pitch, j); };
+    auto row = [&](int c, auto j) { return Number(Real(0)) + collect(packed + c * pitch, j); };
     const Vector x = {row(0, self), row(1, self), row(2, self)};
     const Number radius = row(3, self);
     Number volume = 0;
-    auto add = [&](Index j, Mask listed) {
+    auto add = [&](auto j, Mask listed) {
         const Vector r = {x.x - row(0, j), x.y - row(1, j), x.z - row(2, j)};
-        volume += shared_volume(dot(r, r), radius, row(3, j), listed & accepts(self, j));
+        const Number other_radius = row(3, j), contact = radius + other_radius;
+        const Mask overlapping = listed & (dot(r, r) < contact * contact);
+        if (!any(overlapping)) return;
+        volume += shared_volume(dot(r, r), radius, other_radius, overlapping & accepts(self, Index(j)));
     };
     walk_lists(lists.overlap.data, lists.overlap_count.data, self, lane_count, Index(begin), Index(end), add);
     return group_sum(volume);

@@ -9,7 +9,8 @@
 
 namespace warpmag {
 
-constexpr int TARGETS = 64; // targets that a thread takes at a time
+constexpr int TARGETS = 64;        // targets that a thread takes at a time
+constexpr int LONGEST_RANKED = 64; // entries up to which ranks take less time than a sort
 
 // Sources in the order of their buckets: index, body, column, group, position and radius. ``begin[b]`` is the first
 // source of bucket b. ``bucket`` has the bucket of each source, or −1, in the original order of sources.
@@ -79,8 +80,8 @@ inline int find_around(const SortedSources& s, const Target& t, Cell cell, int* 
     return count;
 }
 
-// Writes a list in ascending order: the rank of an entry is the number of smaller entries.
-inline void write_sorted(int* list, int count, int* out) {
+// Writes a short list in ascending order: the rank of an entry is the number of smaller entries.
+inline void write_ranked(int* list, int count, int* out) {
     const int vectors = (count + WIDTH - 1) / WIDTH;
     put_indices(list + count, Index(__INT_MAX__));
     for (int k = 0; k < count; ++k) {
@@ -88,6 +89,20 @@ inline void write_sorted(int* list, int count, int* out) {
         for (int v = 0; v < vectors; ++v) rank += __builtin_popcount(bits_of(indices(list + WIDTH * v) < list[k]));
         out[rank] = list[k];
     }
+}
+
+// Writes a long list of indices below ``end`` in ascending order: sorts by digits of six bits. Overwrites the list.
+inline void write_sorted(int* list, int count, int end, int* out) {
+    int buffer[CAPACITY], *other = buffer;
+    for (int shift = 0; (end - 1) >> shift > 0; shift += 6) {
+        int begin[65] = {};
+        for (int k = 0; k < count; ++k) ++begin[(list[k] >> shift & 63) + 1];
+        for (int digit = 0; digit < 64; ++digit) begin[digit + 1] += begin[digit];
+        for (int k = 0; k < count; ++k) other[begin[list[k] >> shift & 63]++] = list[k];
+        int* const sorted = other;
+        other = list, list = sorted;
+    }
+    for (int k = 0; k < count; ++k) out[k] = list[k];
 }
 
 // Rebuilds the neighbor lists if a moment has moved too far.
@@ -105,7 +120,10 @@ inline void search_neighbors(const Lists& targets, const Lists& sources, int thr
         const Target target = {balls.x[i],      balls.y[i],          balls.z[i],
                                balls.radius[i], (Real)targets.ratio, same ? targets.body.data[i] : -1};
         const int count = find_around(sorted, target, cell_of(balls, i, targets.group.data[i], cells_per_meter), list);
-        write_sorted(list, count < CAPACITY ? count : CAPACITY, targets.neighbor.data + (size_t)CAPACITY * i);
+        int* const out = targets.neighbor.data + (size_t)CAPACITY * i;
+        const int listed = count < CAPACITY ? count : CAPACITY;
+        if (listed > LONGEST_RANKED) write_sorted(list, listed, sources.packed.shape[1], out);
+        else write_ranked(list, listed, out);
         targets.count.data[i] = count;
         Real* const found_at = (Real*)targets.found_at.data + 3 * i;
         found_at[0] = target.x, found_at[1] = target.y, found_at[2] = target.z;
