@@ -151,6 +151,18 @@ def test_a_camera_that_sees_no_body_is_replaced_unless_it_is_named(stage, device
     assert lines[-1] == "camera /World/Camera"
 
 
+def test_a_camera_that_usd_cannot_place(stage, tmp_path, capsys):
+    """``check`` reads no cameras, and finds the stage sound."""
+    opened = Usd.Stage.Open(str(stage))
+    opened.GetPrimAtPath("/World/Camera").GetAttribute("xformOpOrder").Set(["elsewhere"])
+    opened.Export(str(tmp_path / "scene.usda"))
+    opened.Reload()
+    assert cli.main(["render", str(tmp_path / "scene.usda"), "-o", str(tmp_path / "a.png")]) == cli.BAD_INPUT
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("warpmag: /World/Camera: Newton cannot look from it (Invalid xform op")
+    assert not (tmp_path / "a.png").exists()
+
+
 def test_bad_input_is_one_line(stage, tmp_path, capsys):
     (tmp_path / "file").touch()
     for arguments, text in (

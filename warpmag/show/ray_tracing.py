@@ -312,9 +312,13 @@ def _camera_prim(stage, name: str | None):
 
 
 def _view_of(prim, camera: Any, width: int, height: int) -> tuple[Any, Any]:
-    """Return the rays in the frame of a camera, shape [height, width, 1, 2, 3], and the pose of the camera."""
-    rays: Any = camera.compute_camera_rays_pinhole_usd(width, height, prim, device="cpu")
-    return rays.numpy(), wp.transform(*camera.compute_camera_transforms_usd(prim).numpy()[0])
+    """Return the rays in the frame of a camera, shape [height, width, 1, 2, 3], and the pose of the camera.
+
+    A camera whose lens or transform cannot be read raises :class:`InputError`.
+    """
+    with newton_errors(str(prim.GetPath()), "look from"):
+        rays: Any = camera.compute_camera_rays_pinhole_usd(width, height, prim, device="cpu")
+        return rays.numpy(), wp.transform(*camera.compute_camera_transforms_usd(prim).numpy()[0])
 
 
 def _view_of_bodies(

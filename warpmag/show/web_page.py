@@ -16,6 +16,7 @@ from warpmag.errors import InputError, extra
 from warpmag.show.glb import glb
 from warpmag.show.materials import bound_material, surface_value
 from warpmag.show.meshes import corner_normals, shape_of, triangles_of
+from warpmag.usd.read.input_errors import usd_errors
 from warpmag.usd.read.transforms import rigid_part, rotation_of
 from warpmag.usd.values import number, value_of, vector
 
@@ -176,7 +177,8 @@ def _put_camera(server, stage: Usd.Stage, batches: list[_Batch], scale: float) -
     target = scale * _box(batches).mean(axis=0) if batches else np.zeros(3)
     cameras = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
     if cameras:
-        frame = np.array(UsdGeom.XformCache(stage.GetStartTimeCode()).GetLocalToWorldTransform(cameras[0]))
+        with usd_errors(str(cameras[0].GetPath()), "USD cannot compose its transform"):
+            frame = np.array(UsdGeom.XformCache(stage.GetStartTimeCode()).GetLocalToWorldTransform(cameras[0]))
         direction = frame[2, :3]
     else:
         direction = np.roll(_DIRECTION, up - 2)
