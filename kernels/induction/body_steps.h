@@ -1,11 +1,11 @@
 // Steps of bodies as a whole: the residuals r of a body's cells become r + w (Q − 1) r; body_steps.py has the
 // equations.
 //
-// WRITE_RESIDUALS writes the residuals of cells in the frames of their bodies. WRITE_WEIGHTS writes the weight w of
-// each body. CHANGE_FIELD multiplies the residuals by the table Q − 1, and adds the result to the field. Bodies with
-// the same table form groups of at most ``MEMBERS``, so that a GPU reads the table once for several bodies; a CPU,
-// whose caches hold the table, has groups of one. On a CPU a pass works on a vector of cells, on a GPU ``GROUP``
-// threads have one cell.
+// Q acts on parities of the mirrored body separately (``warpmag.shapes.body_response``). FOLD writes the parts of the
+// residuals of each parity, in the frames of the bodies, and WRITE_WEIGHTS the weight w of each body. MULTIPLY
+// multiplies each part by its table Q − 1. UNFOLD adds the result to the field. Bodies with the same tables form groups
+// of at most ``MEMBERS``, so that a GPU reads a table once for several bodies; a CPU, whose caches hold the tables, has
+// groups of one. On a CPU a pass works on a vector of orbits, on a GPU ``GROUP`` threads multiply for one orbit.
 // ``BodySteps`` is the struct of body_steps.py.
 #pragma once
 #include "cells/rotation.h"
@@ -16,39 +16,132 @@
 namespace warpmag {
 
 constexpr int ENTRY = 9 * CHUNK; // words of a table for a pair of sources and CHUNK targets
+constexpr int MIRRORS = 8;       // sets of mirrors across x, y and z
 
-enum BodyPass { WRITE_RESIDUALS, WRITE_WEIGHTS, CHANGE_FIELD }; // as in body_steps.py
+enum BodyPass { FOLD, WRITE_WEIGHTS, MULTIPLY, UNFOLD }; // as in body_steps.py
 
 template <class Steps> CUDA_CALLABLE inline bool skips_steps(const Steps& steps, int world) {
     const auto& solve = steps.state.worlds.data[world];
     return solve.active == 0 || solve.apart > 0;
 }
-// Cells of a body from ``offset`` on.
-template <class Steps> CUDA_CALLABLE inline Span cells_at(const Steps& steps, int body, int offset) {
-    const auto& cells = steps.body.data[body]; // first moment, count, rotation, world
-    const int left = cells[1] - offset;
-    return {0, cells[0] + offset, left < 0 ? 0 : left > WIDTH ? WIDTH : left, cells[3], 0, 0};
-}
 template <class Steps> CUDA_CALLABLE inline Rotation<Real> rotation_of_body(const Steps& steps, int body) {
     return rotation_of<Real>(steps.rotation.data[steps.body.data[body][2]]);
 }
-// Address of the residuals of the first cell of a group. Each cell has the x, y and z of all members side by side.
-template <class Steps> CUDA_CALLABLE inline Real* residuals_of(const Steps& steps, int group) {
-    return (Real*)steps.residual.data + 3 * MEMBERS * (size_t)steps.group.data[group][3];
+
+// Orbits of a body from ``offset`` on: their number, the body's first moment and mirrors, and the place of the first of
+// these orbits in the arrays of images and of parts.
+struct Orbits {
+    int count, moment, mirrors, image, pitch, place, step;
+};
+template <class Steps> CUDA_CALLABLE inline Orbits orbits_at(const Steps& steps, int body, int offset) {
+    const auto& group = steps.group.data[body / MEMBERS]; // first image, mirrors, number of orbits, first place
+    const auto& cells = steps.body.data[body];            // first moment, number of cells, rotation, world
+    const int left = cells[1] == 0 ? 0 : group[2] - offset;
+    return {left < 0       ? 0
+            : left > WIDTH ? WIDTH
+                           : left,
+            cells[0],
+            group[1],
+            group[0] + offset,
+            (group[2] + CHUNK - 1) / CHUNK * CHUNK,
+            group[3] + offset,
+            group[2] + group[2] % 2};
+}
+// Moments of the images of orbits by a set of mirrors. Those of a cell that occurs before are negative, −1 − moment.
+template <class Steps> CUDA_CALLABLE inline Index images_at(const Steps& steps, const Orbits& at, int mirror) {
+    const Index cell = indices(steps.image.data + at.image + mirror * at.pitch);
+    return cell < 0 ? cell - at.moment : cell + at.moment;
+}
+template <class Array> CUDA_CALLABLE inline Vector vectors_of(const Array& array, Index i) {
+    const Real* const numbers = (const Real*)array.data;
+    return {collect(numbers, 3 * i), collect(numbers + 1, 3 * i), collect(numbers + 2, 3 * i)};
+}
+template <class Array> CUDA_CALLABLE inline void put_lane(const Array& array, int i, Vector v, int lane) {
+    Real* const to = (Real*)array.data + 3 * (size_t)i;
+    to[0] = lane_of(v.x, lane), to[1] = lane_of(v.y, lane), to[2] = lane_of(v.z, lane);
+}
+// Sums over the mirrors, v[p] = Σ_g (−1)^(p·g) v[g] for each component; p·g counts the mirrors in both.
+CUDA_CALLABLE inline void transform(Vector (&v)[MIRRORS], int mirrors) {
+#pragma unroll
+    for (int bit = 1; bit < MIRRORS; bit *= 2) {
+        if (!(mirrors & bit)) continue;
+#pragma unroll
+        for (int g = 0; g < MIRRORS; ++g) {
+            if (g & bit) continue;
+            const Vector sum = v[g] + v[g | bit];
+            v[g | bit] = v[g] - v[g | bit], v[g] = sum;
+        }
+    }
+}
+// Calls visit(p, offset) for each parity, with the offset of its part of the orbits in an array of parts.
+template <class Visit> CUDA_CALLABLE inline void visit_parities(const Orbits& at, Visit visit) {
+    size_t place = at.place;
+#pragma unroll
+    for (int p = 0; p < MIRRORS; ++p) {
+        if (p & ~at.mirrors) continue;
+        visit(p, 3 * MEMBERS * place);
+        place += at.step;
+    }
 }
 
-// Writes k H/Ms − s of the cells of a body from ``offset`` on.
-template <class Steps> CUDA_CALLABLE inline void write_residuals(const Steps& steps, int body, int offset) {
-    const Span at = cells_at(steps, body, offset);
-    if (share() != 0 || at.count == 0 || skips_steps(steps, at.world)) return;
-    const Number slope = numbers_or(entries(steps.state.slope, at), at.count, 0);
-    const Number factor = slope / numbers_or(entries(steps.state.saturation, at), at.count, 1);
-    const Vector residual = factor * get(steps.state.h, at) - get(steps.state.s, at);
-    const Vector local = to_body(rotation_of_body(steps, body), residual);
-    Real* const out = residuals_of(steps, body / MEMBERS) + body % MEMBERS;
-    for (int l = 0; l < at.count; ++l) {
-        Real* const to = out + 3 * MEMBERS * (size_t)(offset + l);
-        to[0] = lane_of(local.x, l), to[MEMBERS] = lane_of(local.y, l), to[2 * MEMBERS] = lane_of(local.z, l);
+// Writes the parts of k H/Ms − s at the orbits of a body from ``offset`` on: for each orbit x, y and z of all members
+// of the body's group side by side. A component changes its sign by the mirror across its axis.
+template <class Steps> CUDA_CALLABLE inline void fold(const Steps& steps, int body, int offset) {
+    const Orbits at = orbits_at(steps, body, offset);
+    if (share() != 0 || at.count == 0 || skips_steps(steps, steps.body.data[body][3])) return;
+    const Rotation<Real> rotation = rotation_of_body(steps, body);
+    Vector v[MIRRORS];
+    Real scale = 1;
+    for (int bit = 1; bit < MIRRORS; bit *= 2) scale *= at.mirrors & bit ? Real(0.5) : 1;
+#pragma unroll
+    for (int g = 0; g < MIRRORS; ++g) {
+        if (g & ~at.mirrors) continue;
+        const Index signed_moment = images_at(steps, at, g);
+        const Index i = signed_moment < 0 ? -1 - signed_moment : signed_moment;
+        const Number factor = collect(steps.state.slope.data, i) / collect(steps.state.saturation.data, i);
+        v[g] = scale * to_body(rotation, factor * vectors_of(steps.state.h, i) - vectors_of(steps.state.s, i));
+    }
+    transform(v, at.mirrors);
+    Real* const out = steps.residual.data + body % MEMBERS;
+    visit_parities(at, [&](int p, size_t first) {
+        const Number x = v[p ^ (1 & at.mirrors)].x, y = v[p ^ (2 & at.mirrors)].y, z = v[p ^ (4 & at.mirrors)].z;
+        for (int l = 0; l < at.count; ++l) {
+            Real* const to = out + first + 3 * MEMBERS * l;
+            to[0] = lane_of(x, l), to[MEMBERS] = lane_of(y, l), to[2 * MEMBERS] = lane_of(z, l);
+        }
+    });
+}
+
+// Adds the changes of the field at the orbits of a body from ``offset`` on.
+template <class Steps> CUDA_CALLABLE inline void unfold(const Steps& steps, int body, int offset) {
+    const Orbits at = orbits_at(steps, body, offset);
+    if (share() != 0 || at.count == 0 || skips_steps(steps, steps.body.data[body][3])) return;
+    const Real* const parts = steps.response.data + body % MEMBERS;
+    Vector v[MIRRORS];
+    visit_parities(at, [&](int p, size_t first) {
+        Number components[3];
+        for (int c = 0; c < 3; ++c) {
+            Real lanes[WIDTH] = {};
+            for (int l = 0; l < at.count; ++l) lanes[l] = parts[first + 3 * MEMBERS * l + c * MEMBERS];
+            components[c] = numbers(lanes);
+        }
+        v[p ^ (1 & at.mirrors)].x = components[0], v[p ^ (2 & at.mirrors)].y = components[1];
+        v[p ^ (4 & at.mirrors)].z = components[2];
+    });
+    transform(v, at.mirrors);
+    const Rotation<Real> rotation = rotation_of_body(steps, body);
+    const Real weight = steps.weight.data[body];
+#pragma unroll
+    for (int g = 0; g < MIRRORS; ++g) {
+        if (g & ~at.mirrors) continue;
+        const Index moment = images_at(steps, at, g), i = moment < 0 ? at.moment : moment;
+        const Number scale = weight * collect(steps.state.saturation.data, i) / collect(steps.state.slope.data, i);
+        const Vector change = scale * to_world(rotation, v[g]), h = vectors_of(steps.state.h, i) + change;
+        for (int l = 0; l < at.count; ++l) {
+            if (lane_of(moment, l) < 0) continue;
+            put_lane(steps.state.h_change, lane_of(moment, l), change, l);
+            put_lane(steps.state.h, lane_of(moment, l), h, l);
+        }
     }
 }
 
@@ -60,7 +153,8 @@ template <class Steps> CUDA_CALLABLE inline void write_weight(const Steps& steps
     Number shares = Number(Real(0)), excesses = shares;
     const Number zero = shares, full = zero + 1;
     for (int k = WIDTH * share(); k < cells[1]; k += WIDTH * SHARES) {
-        const Span at = cells_at(steps, body, k);
+        const int left = cells[1] - k;
+        const Span at = {0, cells[0] + k, left > WIDTH ? WIDTH : left, cells[3], 0, 0};
         const Number radius = numbers_or(entries(state.packed, at, 3), at.count, 0);
         const Number slope = numbers_or(entries(state.slope, at), at.count, 0);
         const Number saturation = numbers_or(entries(state.saturation, at), at.count, 1);
@@ -109,16 +203,17 @@ CUDA_CALLABLE inline void add_products(const Real* residuals, Vector (&sums)[MEM
     }
 }
 
-// Adds the changes of the field at the cells of a group from ``offset`` on.
-template <class Steps> CUDA_CALLABLE inline void add_changes(const Steps& steps, int group, int offset) {
-    const auto& of_group = steps.group.data[group]; // number of members, cells, first words of the table, first cell
-    const int first_body = MEMBERS * group, cells = of_group[1];
+// Multiplies the part of a parity by its table, for the orbits from ``offset`` on.
+template <class Steps> CUDA_CALLABLE inline void multiply(const Steps& steps, int number, int offset) {
+    const auto& part = steps.part.data[number]; // group of bodies, number of orbits, first entry of the table, place
     bool any_active = false;
-    for (int w = 0; w < of_group[0]; ++w) any_active |= !skips_steps(steps, steps.body.data[first_body + w][3]);
+    for (int body = MEMBERS * part[0]; body < MEMBERS * (part[0] + 1); ++body)
+        any_active |= steps.body.data[body][1] > 0 && !skips_steps(steps, steps.body.data[body][3]);
     if (!any_active) return;
-    const Real* const residuals = residuals_of(steps, group);
-    const int chunk = offset / CHUNK, lane = offset % CHUNK, pairs = (cells + 1) / 2;
-    const int* const table = steps.table.data + (size_t)ENTRY * (of_group[2] + chunk * pairs) + lane;
+    const size_t first = 3 * MEMBERS * (size_t)part[3];
+    const Real* const residuals = steps.residual.data + first;
+    const int chunk = offset / CHUNK, lane = offset % CHUNK, pairs = (part[1] + 1) / 2, left = part[1] - offset;
+    const int* const table = steps.table.data + (size_t)ENTRY * (part[2] + chunk * pairs) + lane;
     const Number zero = Number(Real(0));
     Vector sums[MEMBERS];
     for (int w = 0; w < MEMBERS; ++w) sums[w] = {zero, zero, zero};
@@ -131,16 +226,14 @@ template <class Steps> CUDA_CALLABLE inline void add_changes(const Steps& steps,
         add_products(pair_residuals, sums, [&](int k) { return lower_number(words[k]); });
         add_products(pair_residuals + 3 * MEMBERS, sums, [&](int k) { return upper_number(words[k]); });
     }
+    Real* const out = steps.response.data + first + 3 * MEMBERS * (size_t)offset;
     for (int w = 0; w < MEMBERS; ++w) {
-        const Vector response = group_sums(sums[w]);
-        const Span at = cells_at(steps, first_body + w, offset);
-        if (share() != 0 || at.count == 0 || skips_steps(steps, at.world)) continue;
-        const Number scale = numbers_or(entries(steps.state.saturation, at), at.count, 0)
-                             / numbers_or(entries(steps.state.slope, at), at.count, 1)
-                             * steps.weight.data[first_body + w];
-        const Vector change = scale * to_world(rotation_of_body(steps, first_body + w), response);
-        set(steps.state.h, at, get(steps.state.h, at) + change);
-        set(steps.state.h_change, at, change);
+        const Vector sum = group_sums(sums[w]);
+        if (share() != 0) continue;
+        for (int l = 0; l < (left < WIDTH ? left : WIDTH); ++l) {
+            Real* const to = out + 3 * MEMBERS * l + w;
+            to[0] = lane_of(sum.x, l), to[MEMBERS] = lane_of(sum.y, l), to[2 * MEMBERS] = lane_of(sum.z, l);
+        }
     }
 }
 
@@ -151,17 +244,18 @@ CUDA_CALLABLE inline void add_body_steps(int thread, int first, int last, int th
             for (int body = row; body < row + WIDTH && body < steps.body.shape[0]; ++body) write_weight(steps, body);
             return;
         }
-        const auto& chunk = (pass == WRITE_RESIDUALS ? steps.body_chunk : steps.group_chunk).data[row / CHUNK];
-        const int offset = chunk[1] + row % CHUNK; // chunk: body or group, first cell
-        if (pass == WRITE_RESIDUALS) write_residuals(steps, chunk[0], offset);
-        else add_changes(steps, chunk[0], offset);
+        const auto& chunk = (pass == MULTIPLY ? steps.part_chunk : steps.body_chunk).data[row / CHUNK];
+        const int offset = chunk[1] + row % CHUNK; // chunk: part or body, first orbit
+        if (pass == FOLD) fold(steps, chunk[0], offset);
+        else if (pass == MULTIPLY) multiply(steps, chunk[0], offset);
+        else unfold(steps, chunk[0], offset);
     };
 #if defined(__CUDA_ARCH__)
     make_pass(first, thread / GROUP);
 #else
     auto items = [&](int pass) {
         if (pass == WRITE_WEIGHTS) return (int)steps.body.shape[0];
-        return CHUNK * (int)(pass == WRITE_RESIDUALS ? steps.body_chunk : steps.group_chunk).shape[0];
+        return CHUNK * (int)(pass == MULTIPLY ? steps.part_chunk : steps.body_chunk).shape[0];
     };
     run_passes(team, threads, first, last, items, WIDTH, make_pass);
 #endif

@@ -11,11 +11,14 @@ After a step that the flow rejects, w is 0 for some solves.
 
 Sweeps leave out the pairs within such a body. Letters in contact take half as many evaluations as with sweeps alone, a
 plate on a magnet a quarter. The elements of Q − 1 are halves of words, the upper halves of float32: steps need no more
-digits, and reading the table takes most of the time.
+digits, and reading the tables takes most of the time. Where mirrors map the cells of a body to each other, there is a
+table for each parity (``warpmag.shapes.body_response``): the residuals of the images of a cell are added up with the
+signs of the parity, and the results are distributed with the same signs.
 """
 
 from collections.abc import Sequence
 from functools import cache
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -27,13 +30,15 @@ from warpmag.kernels.shared.pieces import cut
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
-WRITE_RESIDUALS, WRITE_WEIGHTS, CHANGE_FIELD = range(3)  # the passes, in order; as in ``body_steps.h``
+FOLD, WRITE_WEIGHTS, MULTIPLY, UNFOLD = range(4)  # the passes, in order; as in ``body_steps.h``
 _CONTACT = 0.2
 """Twice the volume over its own that a cell's ball shares with balls of bodies in contact, up to which e is 0."""
 _MEMBERS = 8
-"""Bodies with the same table that threads of a GPU compute together."""
+"""Bodies with the same tables that threads of a GPU compute together."""
 _FEW_THREADS = 2
-"""Threads of a GPU that share a cell of such bodies: a warp reads neighboring words of the table."""
+"""Threads of a GPU that share an orbit of such bodies: a warp reads neighboring words of the table."""
+_ENTRY = 9 * CHUNK
+"""Words of a table for a pair of sources and CHUNK targets; as in ``body_steps.h``."""
 _PRODUCTS_PER_THREAD = 200_000
 """Products of a tensor and a residual per thread of a CPU, at least: some 50 µs of work."""
 
@@ -45,14 +50,19 @@ def _steps_type(dtype):
 
     @wp.struct
     class BodyStepArrays:
-        table: wp.array[int]  # Q − 1 of all kinds of bodies, two elements a word (:func:`_packed_table`)
+        table: wp.array[int]  # Q − 1 of all kinds of bodies and parities, two elements a word (:func:`_packed_table`)
+        image: wp.array[
+            int
+        ]  # cells of each orbit by sets of mirrors, of all kinds of bodies, [MIRRORS · padded orbits]
         body: wp.array[wp.vec4i]  # by groups: first moment, cells or 0, index of the rotation, world
-        group: wp.array[wp.vec4i]  # members, number of cells, first entry of the table, first cell in ``residual``
-        body_chunk: wp.array[wp.vec2i]  # body and first of up to CHUNK cells
-        group_chunk: wp.array[wp.vec2i]  # group and first of up to CHUNK cells
+        group: wp.array[wp.vec4i]  # of bodies: first image, bits of mirrors, orbits, first place in ``residual``
+        part: wp.array[wp.vec4i]  # of each parity: group, orbits, first entry of the table, first place
+        body_chunk: wp.array[wp.vec2i]  # body and first of up to CHUNK orbits
+        part_chunk: wp.array[wp.vec2i]  # part and first of up to CHUNK orbits
         gain: wp.array[dtype]  # largest eigenvalue of Q − 1 of each body
         rotation: wp.array[quaternion]  # from the frames of bodies to the world (x, y, z, w)
-        residual: wp.array[dtype]  # residuals in the frames of the bodies, shape [cells of groups, 3, members]
+        residual: wp.array[dtype]  # residuals by parity, in the frames of the bodies, shape [places, 3, members]
+        response: wp.array[dtype]  # their products with Q − 1, same shape
         weight: wp.array[dtype]  # w of each body
         state: state_type(dtype)
 
@@ -60,7 +70,7 @@ def _steps_type(dtype):
 
 
 def _packed_table(response: np.ndarray) -> np.ndarray:
-    """Return Q − 1 in words, shape [chunks of targets, pairs of sources, 9, CHUNK], from its shape [n, 3, n, 3].
+    """Return Q − 1 in words, [chunks of targets · pairs of sources · 9 · CHUNK], from its shape [n, 3, n, 3].
 
     The lower half of a word belongs to the first source of a pair, the upper half to the second.
     """
@@ -70,7 +80,16 @@ def _packed_table(response: np.ndarray) -> np.ndarray:
     halves[:count, :, :count] = response
     # chunk, lane, row, pair, half, column -> chunk, pair, row, column, lane, half
     halves = halves.reshape(chunks, CHUNK, 3, pairs, 2, 3).transpose(0, 3, 2, 5, 1, 4)
-    return np.ascontiguousarray(halves).view(np.int32).reshape(chunks, pairs, 9, CHUNK)
+    return np.ascontiguousarray(halves).view(np.int32).reshape(-1)
+
+
+def _padded_images(images: np.ndarray) -> np.ndarray:
+    """Return the images of orbits, shape [8, padded orbits]; −1 − cell where a cell occurs in an earlier row."""
+    padded = np.pad(images, ((0, 0), (0, -images.shape[1] % CHUNK)))
+    for row in range(1, len(padded)):
+        occurs = (padded[:row] == padded[row]).any(axis=0)
+        padded[row] = np.where(occurs, -1 - padded[row], padded[row])
+    return padded.astype(np.int32)
 
 
 @cache
@@ -85,18 +104,18 @@ class BodySteps:
     """Steps of bodies as a whole, repeatedly in the same arrays.
 
     Args:
-        bodies: For each body its first moment, the index of its rotation, Q − 1 in its frame as the upper halves of
-            float32, shape [n, 3, n, 3], and the largest eigenvalue of Q − 1. Bodies with the same array share it.
+        bodies: For each body its first moment, the index of its rotation, and its response in its frame
+            (``warpmag.shapes.body_response.BodyResponse``). Bodies with the same response share it.
         worlds: World of each body.
         rotations: Rotations from the frames of bodies to the world (x, y, z, w).
         state: State of the solve (``solve_state``), bound to its moments.
     """
 
-    def __init__(self, bodies: Sequence[tuple[int, int, np.ndarray, float]], worlds, rotations, state):
+    def __init__(self, bodies: Sequence[tuple[int, int, Any]], worlds, rotations, state):
         """Lay out the tables on the device of the state."""
         device, dtype = state.h.device, state.packed.dtype
         kinds: dict[int, list[int]] = {}
-        for number, (_, _, response, _) in enumerate(bodies):
+        for number, (_, _, response) in enumerate(bodies):
             kinds.setdefault(id(response), []).append(number)
         is_shared = device.is_cuda and len(bodies) >= _MEMBERS * len(kinds)
         members = _MEMBERS if is_shared else 1
@@ -105,45 +124,55 @@ class BodySteps:
         steps.rotation, steps.state = rotations, state
         self._lay_out(bodies, worlds, kinds.values(), members, device)
         group = _FEW_THREADS if is_shared else group_threads(device)
-        products = sum(len(response) ** 2 for _, _, response, _ in bodies)
+        products = sum(response.tables.size // 9 for _, _, response in bodies)
         threads, kernel = threads_for(products, _PRODUCTS_PER_THREAD), _kernel(dtype, members, group)
-        items = CHUNK * len(steps.body_chunk), len(steps.body), CHUNK * len(steps.group_chunk)
-        ranges = [(k, k) for k in range(CHANGE_FIELD + 1)] if device.is_cuda else [(WRITE_RESIDUALS, CHANGE_FIELD)]
+        orbits = CHUNK * len(steps.body_chunk)
+        items = orbits, len(steps.body), CHUNK * len(steps.part_chunk), orbits
+        ranges = [(k, k) for k in range(UNFOLD + 1)] if device.is_cuda else [(FOLD, UNFOLD)]
         self._launches = []
         for first, last in ranges:
             sizes = dict(device=device, threads=threads, gpu_threads=group * items[first])
             self._launches.append(launch_passes(kernel, first, last + 1, steps, record_cmd=True, **sizes))
 
     def _lay_out(self, bodies, worlds, kinds, members: int, device):
-        """Fill the arrays; ``kinds`` are the indices of the bodies of each table."""
-        steps, rows, gains, groups, tables, entries, first_cell = self._steps, [], [], [], [], 0, 0
+        """Fill the arrays; ``kinds`` are the indices of the bodies of each response."""
+        steps, rows, gains, groups, parts, tables, images, place = self._steps, [], [], [], [], [], [], 0
+        first_image = entry = 0
         for numbers in kinds:
             response = bodies[numbers[0]][2]
-            count, table = len(response), _packed_table(response)
+            orbits, packed = response.images.shape[1], [_packed_table(table) for table in response.tables]
             for begin in range(0, len(numbers), members):
-                part = numbers[begin : begin + members]
-                groups.append((len(part), count, entries, first_cell))
-                first_cell += 2 * table.shape[1]
-                rows += [(bodies[n][0], count, bodies[n][1], worlds[n]) for n in part]
-                gains += [bodies[n][3] for n in part]
-                rows += [(0, 0, 0, 0)] * (members - len(part))
-                gains += [1.0] * (members - len(part))
-            tables.append(table.reshape(-1))
-            entries += table.shape[0] * table.shape[1]
-        counts = np.array(rows)[:, 1], np.array(groups)[:, 1]
+                some = numbers[begin : begin + members]
+                parts += [
+                    (len(groups), orbits, entry + k * len(packed[0]) // _ENTRY, place + k * (orbits + orbits % 2))
+                    for k in range(len(packed))
+                ]
+                groups.append((first_image, response.mirrors, orbits, place))
+                place += len(packed) * (orbits + orbits % 2)
+                rows += [(bodies[n][0], response.cells, bodies[n][1], worlds[n]) for n in some]
+                rows += [(0, 0, 0, 0)] * (members - len(some))
+                gains += [response.largest] * members
+            tables += packed
+            entry += sum(len(table) for table in packed) // _ENTRY
+            images.append(_padded_images(response.images))
+            first_image += images[-1].size
 
         def put(values, kind):
             return wp.array(np.asarray(values), dtype=kind, device=device)
 
-        def chunks(count):
-            number, offset, _ = cut(np.zeros(len(count), int), count, CHUNK)
+        def chunks(counts):
+            number, offset, _ = cut(np.zeros(len(counts), int), np.array(counts), CHUNK)
             return put(np.stack([number, offset], axis=1).astype(np.int32), wp.vec2i)
 
         dtype = steps.rotation.dtype._wp_scalar_type_
         steps.table, steps.gain = put(np.concatenate(tables), wp.int32), put(gains, dtype)
-        steps.body, steps.group = (put(np.array(table, np.int32), wp.vec4i) for table in (rows, groups))
-        steps.body_chunk, steps.group_chunk = (chunks(count) for count in counts)
-        steps.residual = wp.zeros(3 * members * first_cell, dtype=dtype, device=device)
+        steps.image = put(np.concatenate([image.ravel() for image in images]), wp.int32)
+        steps.body, steps.group, steps.part = (
+            put(np.array(table, np.int32), wp.vec4i) for table in (rows, groups, parts)
+        )
+        steps.body_chunk = chunks([groups[k // members][2] for k in range(len(rows))])
+        steps.part_chunk = chunks([part[1] for part in parts])
+        steps.residual, steps.response = (wp.zeros(3 * members * place, dtype=dtype, device=device) for _ in range(2))
         steps.weight = wp.zeros(len(rows), dtype=dtype, device=device)
 
     def launch(self):

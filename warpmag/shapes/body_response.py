@@ -4,16 +4,25 @@ An induction solve compares the reduced field g of each moment with its dual var
 lone body of χ = ∞, far from saturation, is solved by s + Q (g − s) with Q = (1 − 3 T V)⁻¹. Here 3 is the initial slope
 k of a ball, T are the tensors between the body's cells, and V their volumes. Among other bodies, Q takes the slow modes
 of the body itself out of the iteration.
+
+**Mirrors.** Let the cells of a body be symmetric with respect to planes through its center, across m of the axes. Then
+the operator acts separately on magnetizations of each of 2ᵐ parities p: those that each mirror leaves as they are, or
+changes the sign of. A mirror across an axis changes the sign of the component along this axis. The cells that mirrors
+map to each other are an orbit. A magnetization of parity p follows from that of one cell in each orbit. So 2ᵐ matrices
+between orbits replace that between cells. For a plate they have an eighth of the elements.
 """
 
+from typing import NamedTuple
+
 import numpy as np
+from scipy.spatial import KDTree
 
 from warpmag.shapes.demagnetization import Coupling
 from warpmag.shapes.lattice import Lattice
 from warpmag.shapes.uniform_response import cell_matrix
 
 MOST_CELLS = 1000
-"""Largest number of cells of a body with a response: a table of 18 MB. That of 722 cells takes 1 s and 9.4 MB."""
+"""Largest number of cells of a body with a response: a matrix of 9 million elements before the inversion."""
 _SLOPE = 3.0
 """Initial slope k = 3χ/(3 + χ) of a ball of χ = ∞."""
 _SHIFT = 0.01
@@ -21,27 +30,101 @@ _SHIFT = 0.01
 0.001. With 0.03 a lone plate of χ = ∞ takes 1.5 times as many evaluations, with 0.001 one of χ = 300 1.3 times."""
 _POWERS = 30
 """Products with a vector that give the largest eigenvalue, to some percent."""
+_SYMMETRIC = 1e-3
+"""Largest relative change by a mirror: of the product of the operator with a random vector, and of radii; and of
+positions, in radii. Solves converge to the same solution with any response."""
 
 
-def residual_response(coupling: Coupling) -> tuple[np.ndarray, float]:
-    """Return Q − 1 between the cells of a body, in its frame, and its largest eigenvalue.
+class BodyResponse(NamedTuple):
+    """Q − 1 of a body, by parity."""
 
-    The elements are the upper halves of float32, rounded to nearest, shape [n, 3, n, 3], type uint16.
+    cells: int  # number of cells
+    mirrors: int  # bits of the axes x, y, z across which the body is symmetric
+    images: np.ndarray  # image of the first cell of each orbit by the mirrors of the bits of g, shape [8, orbits]
+    tables: np.ndarray  # Q − 1 between orbits, shape [parities, orbits, 3, orbits, 3]; upper halves of float32
+    largest: float  # largest eigenvalue
+
+
+def residual_response(coupling: Coupling) -> BodyResponse:
+    """Return Q − 1 between the cells of a body, in its frame.
+
+    The elements are the upper halves of float32, rounded to nearest, type uint16. Parities p ascend, and have no bits
+    but those of ``mirrors``; so do the rows of ``images`` that are used.
     """
     volumes = 4.0 / 3.0 * np.pi * coupling.radii**3
-    root = np.sqrt(volumes)
-    cells = cell_matrix(coupling, Lattice(coupling.positions, volumes, np.zeros(len(root), int)))
+    root, count = np.sqrt(volumes), len(volumes)
+    cells = cell_matrix(coupling, Lattice(coupling.positions, volumes, np.zeros(count, int)))
     shared = (root[:, None, None, None] * coupling.common[:, None] * root[:, None]).reshape(cells.shape)
     unit = np.eye(len(cells))
-    change = np.linalg.inv(unit + _SLOPE * (cells - shared - unit / 3.0) + _SHIFT * unit) - unit
-    scale = np.repeat(root, 3)
-    response = (change * scale / scale[:, None]).astype(np.float32).reshape(len(root), 3, len(root), 3)
-    bits = response.view(np.uint32)
-    return ((bits + 0x7FFF + (bits >> 16 & 1)) >> 16).astype(np.uint16), _largest_eigenvalue(change)
+    operator = unit + _SLOPE * (cells - shared - unit / 3.0) + _SHIFT * unit
+    mirrors, images = _images(operator.reshape(count, 3, count, 3), coupling)
+    scale = np.repeat(root[images[0]], 3)
+    tables, largest = [], 0.0
+    for parity in _within(mirrors):
+        folded = _folded(operator.reshape(count, 3, count, 3), images, mirrors, parity)
+        change = np.linalg.inv(folded) - np.eye(len(folded))
+        largest = max(largest, _largest_eigenvalue(change))
+        response = (change * scale / scale[:, None]).astype(np.float32)
+        bits = response.view(np.uint32).reshape(len(images[0]), 3, len(images[0]), 3)
+        tables.append(((bits + 0x7FFF + (bits >> 16 & 1)) >> 16).astype(np.uint16))
+    return BodyResponse(count, mirrors, images, np.stack(tables), largest)
+
+
+def _within(mirrors: int) -> list[int]:
+    """Return the numbers of three bits that have no other bits than ``mirrors``, ascending."""
+    return [number for number in range(8) if number & ~mirrors == 0]
+
+
+def _images(operator: np.ndarray, coupling: Coupling) -> tuple[int, np.ndarray]:
+    """Return the mirrors of a body, and the images of the first cell of each orbit, shape [8, orbits]."""
+    radii, place = coupling.radii, coupling.positions - 0.5 * (coupling.positions.min(0) + coupling.positions.max(0))
+    tree, count, mirrors = KDTree(place), len(radii), 0
+    images = np.tile(np.arange(count), (8, 1))  # of all cells
+    vector = np.random.default_rng(0).normal(size=(count, 3))
+
+    def product(vector):
+        return (operator.reshape(3 * count, -1) @ vector.ravel()).reshape(-1, 3)
+
+    whole = product(vector)
+    for axis in range(3):
+        signs = np.where(np.arange(3) == axis, -1.0, 1.0)
+        distance, image = tree.query(place * signs)
+        if distance.max() > _SYMMETRIC * radii.min() or not np.allclose(radii[image], radii, rtol=_SYMMETRIC):
+            continue
+        change = product(vector[image] * signs) - whole[image] * signs
+        if np.linalg.norm(change) <= _SYMMETRIC * np.linalg.norm(whole):
+            mirrors |= 1 << axis
+            for mirror in [number for number in range(8) if number >> axis & 1]:
+                images[mirror] = image[images[mirror ^ 1 << axis]]
+    return mirrors, images[:, images.min(axis=0) == np.arange(count)]
+
+
+def _signs(mirror: int, mirrors: int, parity: int) -> np.ndarray:
+    """Return the signs of a parity's components x, y and z at the image of a cell by the mirrors of some bits."""
+    return np.array([(-1.0) ** (mirror & (parity ^ (1 << axis & mirrors))).bit_count() for axis in range(3)])
+
+
+def _folded(operator: np.ndarray, images: np.ndarray, mirrors: int, parity: int) -> np.ndarray:
+    """Return the operator between magnetizations of a parity in the first cells of orbits, shape [3 orbits, 3 orbits].
+
+    Components that a parity does not have in a cell on a mirror are unchanged.
+    """
+    used = _within(mirrors)
+    rows, total = operator[images[0]], np.zeros((len(images[0]), 3, len(images[0]), 3))
+    absent = np.zeros((len(images[0]), 3), bool)
+    for mirror in used:
+        signs = _signs(mirror, mirrors, parity)
+        total += rows[:, :, images[mirror]] * signs
+        absent |= (images[mirror] == images[0])[:, None] & (signs < 0.0)
+    distinct = np.array([len(set(orbit)) for orbit in images[used].T])  # others occur several times
+    folded = (total * (distinct / len(used))[:, None]).reshape(absent.size, absent.size)
+    absent = absent.ravel()
+    folded[absent], folded[:, absent] = 0.0, 0.0
+    return folded + np.diag(absent.astype(float))
 
 
 def _largest_eigenvalue(matrix: np.ndarray) -> float:
-    """Return the largest eigenvalue of a symmetric matrix, by the power method."""
+    """Return the largest eigenvalue of a matrix that is similar to a symmetric one, by the power method."""
     vector, norm = np.random.default_rng(0).normal(size=len(matrix)), 0.0
     for _ in range(_POWERS):
         vector = matrix @ vector
