@@ -10,18 +10,68 @@ from scipy.spatial.transform import Rotation
 
 import warpmag
 from bench.systems import moment_system
+from tests.cell_bodies import posed
 from warpmag.shapes import demagnetization, lattice
-from warpmag.shapes.body_response import MOST_CELLS
+from warpmag.shapes.body_response import MOST_CELLS, residual_response
 from warpmag.shapes.linear_cells import with_slopes
 from warpmag.shapes.uniform_response import cell_matrix
 
 FIELD = (3e3, -2e3, 5e3)  # A/m, far from saturation
 
 
+def coupled(body):
+    return with_slopes(demagnetization.coupling(body, body.radii), body)
+
+
 def filled(sides, spacing):
     """Return the lattice of a box and its coupling."""
     body = lattice.fill(lattice.box(sides), spacing, together=True)
-    return body, with_slopes(demagnetization.coupling(body, body.radii), body)
+    return body, coupled(body)
+
+
+STROKE, OTHER, FOOT = (
+    ((0.002, 0.008, 0.002), (0.0, 0.0, 0.0)),
+    ((0.006, 0.002, 0.002), (0.0, 0.010, 0.0)),
+    ((0.004, 0.002, 0.002), (0.006, -0.006, 0.0)),
+)
+BODIES = {  # boxes, and the bits of the mirrors: of a block, a letter T, a foot on the T, and boxes above each other
+    "block": ([STROKE], 0b111),
+    "T": ([STROKE, OTHER], 0b101),
+    "T with a foot": ([STROKE, OTHER, FOOT], 0b100),
+    "none": ([STROKE, ((0.003, 0.002, 0.002), (0.003, 0.010, 0.002)), FOOT], 0),
+}
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_tables_of_parities_have_the_response_of_the_dense_inverse(name):
+    """The table of each parity acts on sums over the images of cells; bfloat16 has 8 bits."""
+    boxes, mirrors = BODIES[name]
+    body = lattice.fill(posed(*boxes), 0.0015, together=True)
+    coupling, count = coupled(body), len(body.volumes)
+    response = residual_response(coupling)
+    assert response.mirrors == mirrors and len(response.tables) == 2 ** mirrors.bit_count()
+    root = np.sqrt(body.volumes)
+    operator = cell_matrix(coupling, body)  # symmetrized by volumes
+    common = np.einsum("i,ab,j->iajb", root, coupling.common, root).reshape(operator.shape)
+    dense = np.linalg.inv(1.01 * np.eye(len(operator)) + 3.0 * (operator - common - np.eye(len(operator)) / 3.0))
+    vectors = np.random.default_rng(2).normal(size=(count, 3))
+    exact = (dense @ (np.repeat(root, 3) * vectors.ravel())).reshape(-1, 3) / root[:, None] - vectors
+    tables = (response.tables.astype(np.uint32) << 16).view(np.float32).astype(float)
+    parities = [parity for parity in range(8) if not parity & ~mirrors]
+    result = np.zeros((count, 3))
+    for table, parity in zip(tables, parities, strict=True):
+
+        def signs(mirror, parity=parity):  # a mirror reverses the component across it
+            odd = [(mirror & (parity ^ (1 << axis & mirrors))).bit_count() for axis in range(3)]
+            return (-1.0) ** np.array(odd)
+
+        part = sum(vectors[response.images[mirror]] * signs(mirror) for mirror in parities) / len(parities)
+        product = np.einsum("iajb,jb->ia", table, part)
+        parts = np.zeros((count, 3))
+        for mirror in parities:
+            parts[response.images[mirror]] = product * signs(mirror)
+        result += parts
+    assert np.linalg.norm(result - exact) <= 2.0**-8 * np.linalg.norm(exact)
 
 
 @pytest.mark.parametrize(

@@ -1,19 +1,20 @@
-"""Steps of bodies as a whole, added to the field before each step of the accelerated θ flow.
+"""Preconditioner of the θ dynamics: the residual of each iron body, multiplied by the inverse of its own operator.
 
 The residual of a body's moments, r = k H/Ms − s, becomes r + w (Q − 1) r with the inverse Q of the body's own operator
-(``warpmag.shapes.body_response``). The flow then takes its usual step. Q r is the error of a lone body, and ⟨r, Q r⟩
-the square of its energy norm, by which solves end (``theta_step.h``).
+(``warpmag.shapes.body_response``). The θ dynamics then take their usual step. Q r is the error of a lone body, and
+⟨r, Q r⟩ the square of its energy norm, by which solves end (``theta_step.h``).
 
-Q belongs to χ = ∞ without saturation, and to bodies that do not intersect. Let d be the mean of (k/3) ‖M‖/(Ms ‖s‖) over
-the body, and e that of 2 k o_i (``theta_flow.py``) beyond contact. Where Q divides a mode by λ, λ' = 1 − d (1 − λ) + e
-would be right. So w = (1/λ' − 1)/(1/λ − 1) with the least λ of the body, and at least 0, exceeds the factor of no mode.
-After a step that the flow rejects, w is 0 for some solves.
+Q belongs to χ = ∞ without saturation, and to bodies that do not intersect. Q multiplies a mode of eigenvalue λ by 1/λ.
+Saturation and overlap change this eigenvalue to λ' = 1 − d (1 − λ) + e. Here d is the mean of (k/3) ‖M‖/(Ms ‖s‖) over
+the body, and e that of 2 k o_i (``theta_flow.py``) beyond contact. The weight w = max(0, (1/λ' − 1)/(1/λ − 1)), with
+the smallest λ of the body, is the largest that is safe for all modes. After a rejected step, w is 0 in the next few
+solves.
 
-Sweeps leave out the pairs within such a body. Letters in contact take half as many evaluations as with sweeps alone, a
-plate on a magnet a quarter. The elements of Q − 1 are halves of words, the upper halves of float32: steps need no more
-digits, and reading the tables takes most of the time. Where mirrors map the cells of a body to each other, there is a
-table for each parity (``warpmag.shapes.body_response``): the residuals of the images of a cell are added up with the
-signs of the parity, and the results are distributed with the same signs.
+Sweeps leave out the pairs within such a body. Letters in contact take half as many evaluations as with sweeps alone. A
+plate on a magnet takes a quarter as many. The elements of Q − 1 are stored as bfloat16, the upper 16 bits of float32:
+this precision suffices, and reading the tables takes most of the time. If mirrors map the cells of a body to each
+other, there is a table for each parity (``warpmag.shapes.body_response``). The residuals of the images of a cell are
+added with the signs of the parity, and the products are distributed with the same signs.
 """
 
 from collections.abc import Sequence
