@@ -208,7 +208,7 @@ def launch_set_state(state, magnetizations):
 
 
 class Launches:
-    """Recorded launches of the flow on one state, which saves packing its arrays each time."""
+    """Recorded launches of a solve of one state, which saves packing its arrays each time."""
 
     def __init__(self, state):
         """Record the launches for a state bound to its moments (``solve_state.bind``)."""
