@@ -38,7 +38,7 @@ class World:
     is_best: int  # 1 if the last iterate is the best so far
     plain_steps: int  # steps left without mixing
     apart: int  # solves left without sweeps and steps of bodies as a whole (``body_steps``), since one was rejected
-    ahead: wp.float64  # factor β of the last change from solve to solve in the next start
+    ahead: wp.float64  # factor η of the last change from solve to solve in the next start
     best: wp.float64  # smallest merit of this solve, negative before the first evaluation
     alpha: wp.types.vector(DEPTH, wp.float64)  # Anderson coefficients
     slowness: wp.float64  # predicted sum of the remaining steps over the last step

@@ -1,30 +1,32 @@
-"""The accelerated θ flow (Kim and Han 2022, Eqs. 8, 9 and 11, exact in time), kept wholly on the device.
+"""Solve induction by the θ dynamics (Kim and Han 2022, Eqs. 8, 9 and 11), accelerated by Anderson mixing.
+
+The dynamics are integrated exactly in time. All arrays stay on the device.
 
 With M1 and M2 symmetric about H_eff, ‖M‖ = Ms cos θ, and ln cot(θ/2) = artanh(‖M‖/Ms) grows linearly in time. The
-unknown is therefore the dual variable s = k f⁻¹(M)/Ms of every inducible moment, with M = Ms c(‖s‖) ŝ. The exact flow
-over a step is s ← (1 − ω) s + ω k H/Ms, ω = κ/k, κ = βΔtMs. One field evaluation gives the target g = k H(M)/Ms and the
-residual r = g − s. With the last few changes Δs_j, Δr_j, Anderson's step is
+unknown is therefore the dual variable s = k f⁻¹(M)/Ms of every inducible moment, with M = Ms c(‖s‖) ŝ. The exact
+solution over a step is s ← (1 − ω) s + ω k H/Ms, ω = κ/k, κ = βΔtMs. One field evaluation gives the target g =
+k H(M)/Ms and the residual r = g − s. With the last few changes Δs_j, Δr_j, Anderson's step is
 
     s̄ = s − Σ_j α_j Δs_j,   r̄ = r − Σ_j α_j Δr_j,   s ← s̄ + ω r̄,    α = argmin ‖φ r̄‖.
 
 The weight φ = Ms c(a)/a, a = max(‖s‖, ‖g‖), converts a residual to magnetization, so that the large s of saturated
-moments does not dominate. The plain step is mirror descent on the energy Σ V Φ(M) − ½ M·GM − H0·M, which is convex for
-the ball-averaged kernel. Let L_i = 1 + k (2/3 + o_i), with o_i the volume that a ball shares with others, relative to
-its own (``total_overlap`` in ``theta_flow.h``). The energy decreases from any state for ω_i ≤ 1/L_i, and near the
-solution the steps converge for ω_i < 2/L_i. Steps are short only where balls overlap. Cells of bodies that take steps
-as a whole (``body_steps.py``) count o_i twice, because of the demagnetizing factor of overlaps.
+moments does not dominate. The plain step is mirror descent on the energy divided by μ0, Σ V [Φ(M) − ½ M·GM − H0·M]. It
+is convex for the ball-averaged kernel. Let L_i = 1 + k (2/3 + o_i), with o_i the volume that a ball shares with others,
+relative to its own (``total_overlap`` in ``theta_flow.h``). The energy decreases from any state for ω_i ≤ 1/L_i, and
+near the solution the steps converge for ω_i < 2/L_i. Steps are short only where balls overlap. Cells of bodies that
+take steps as a whole (``body_steps.py``) count o_i twice, because of the demagnetizing factor of overlaps.
 
-Once a solve has taken as many evaluations as changes are stored, the newest change, from the last mixture to this
-iterate, becomes that from the last mixture to s̄, if the iterate is the best so far. The coupling is symmetric, so that
-few such changes are as good as all (conjugate residuals; short-term recurrence of Wei, Bao and Liu 2022). Heaps of
-plates and bars then take 26 evaluations instead of 35. Sheets that lie on each other take less than half as many.
-Mixtures are not evaluated: where the iterates do not improve, or r̄ hardly changes, the changes between iterates are
-more precise.
+Let a mixture be a vector s̄. After as many evaluations as stored changes, the newest stored change is replaced if the
+current iterate is the best so far. The new one is the difference between the current s̄ and the previous s̄. The
+coupling is symmetric, so that few such changes are as good as all (conjugate residuals; short-term recurrence of Wei,
+Bao and Liu 2022). Heaps of plates and bars then take 26 evaluations instead of 35. Sheets that lie on each other take
+less than half as many. The field of a mixture is not evaluated. Where iterates do not improve, or r̄ hardly changes,
+differences between iterates are more precise, and are kept.
 
 A step changes the field most at near neighbors. Sweeps update the neighbors' part without another evaluation of the
 whole field. With the coupling G' of the listed neighbors, two sweeps s ← s + ω' (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s)
-follow each step. Here ḡ = s̄ + r̄, and ω' is a little above ω. In cold starts of touching balls they save 1 or 2 of 8
-to 10 evaluations to 1e-3, and more where balls overlap.
+follow each step. Here ḡ = s̄ + r̄, and ω' is a little above ω. In a solve of touching balls from zero magnetization,
+sweeps save one or two field evaluations. They save more where balls overlap.
 
 A step with mixing or sweeps is rejected if it leaves the merit ‖φ r‖ more than twice the best. A few plain steps from
 the best iterate follow, and no more sweeps: where balls overlap cells, sweeps can diverge.
@@ -36,7 +38,7 @@ r̄ as an error, weighted by λ. So the estimate amplifies the residual (Eq. 12)
 
     error = ‖M − f(H)‖/‖f(H)‖ · max(1, σ [λ ‖φ r̄‖ + γ √(‖φ r‖² − ‖φ r̄‖²)]/‖φ r‖),
 
-with λ = ‖φ (2 − ω₁) r‖/‖φ r‖. In long solves slow modes remain in r̄, so λ is at least γ.
+with λ = ‖φ (2 − ω₁) r‖/‖φ r‖. In long solves λ is replaced by max(λ, γ), because slow modes remain in r̄.
 
 Inside a body of iron, closed loops of magnetization have almost no field. They barely change the residual, and do not
 affect forces or fields outside. So in worlds with bodies of cells the error is measured in the energy norm. Let A =
@@ -45,10 +47,11 @@ as a whole:
 
     error = max(‖M − f(H)‖/‖f(H)‖, √(A ⟨M − f(H), M − f(H')⟩/⟨φ s, φ b⟩)).
 
-The energy norm of an error e is √⟨e, r⟩, and such a step has r' = Q r in place of e. Without such steps both factors
-are equal. The energy norm of the solution is √⟨s, b⟩. In a long bar along the field a slow mode dominates the solution,
-and the norms of the error are equal. A steel plate of 60 × 60 × 3 mm that a magnet lifts takes 2 evaluations per solve,
-and its forces have errors of 1e-4.
+The energy norm of an error e is √⟨e, r⟩. For bodies with a step as a whole (``body_steps.py``), r' = Q r approximates
+e. For other bodies M − f(H) and M − f(H') are equal. The energy norm of the solution is √⟨s, b⟩. In a long bar along
+the field a slow mode dominates the solution, and the norms of the error are equal. A steel plate of 60 × 60 × 3 mm that
+a magnet lifts takes 2 evaluations per solve. The end of the solve contributes an error of 1e-4 to the force on the
+plate, without the error of the cells.
 
 With slow convergence many steps like the last one remain. The factor σ is their geometric series ρ/(1 − ρ), and at
 least 1, with ρ the ratio of ‖φ r‖ to its smallest earlier value. At least half of σ is kept at the next evaluation. The
@@ -56,12 +59,12 @@ error is at least a hundredth of the last ‖φ Δs‖, since sweeps over near c
 not included, and a residual at the level of rounding is not amplified. ``python -m bench.accuracy arrangements``
 compares the estimate with the true error.
 
-**Warm start.** The next solve starts at s̄ + ω r̄ + β Δg, with Δg the last change of g from solve to solve. Sweeps over
-neighbors precede its first evaluation. The neighbors' field is computed at their present positions. The field of all
-other sources, F = H − H0 − G' M, is extrapolated as F₁ + β (F₁ − F₂) from the last two solves. Both F are those of s̄
-and ḡ, which are closer to the solution than the last iterate. Each world has a factor β = ⟨φΔg, φΔg'⟩/‖φΔg'‖² within
-[0, 1], the one that best predicts the last change Δg from the change Δg' before it. So the start follows smooth motion,
-and ignores noise.
+**Warm start.** The next solve starts at s̄ + ω r̄ + η Δg, where Δg is the last change of g from solve to solve. Sweeps
+over neighbors precede its first evaluation. The neighbors' field is computed at their present positions. The field of
+all other sources, F = H − H0 − G' M, is extrapolated as F₁ + η (F₁ − F₂) from the last two solves. Both F are those of
+s̄ and ḡ, which are closer to the solution than the last iterate. Each world has its own factor η = ⟨φΔg, φΔg'⟩/‖φΔg'‖²,
+limited to [0, 1]. It is the factor that best predicts the last change Δg from the change Δg' before it. So the start
+follows smooth motion, and ignores noise.
 
 The changes Δs_j, Δr_j are kept for the next solve, since the coupling hardly changes. A slow mode, such as that of long
 columns of balls, then costs one evaluation instead of three. Balls Up, where 243 balls jump, takes 1.2 evaluations per
@@ -205,7 +208,7 @@ def launch_set_state(state, magnetizations):
 
 
 class Launches:
-    """Recorded launches of the flow on one state, which saves packing its arrays each time."""
+    """Recorded launches of a solve of one state, which saves packing its arrays each time."""
 
     def __init__(self, state):
         """Record the launches for a state bound to its moments (``solve_state.bind``)."""

@@ -1,6 +1,7 @@
-"""Launches that are recorded and repeated.
+"""Kernel launches that are recorded and repeated with mostly the same arguments.
 
-Warp takes 12 µs to pack the arguments of a launch on a CPU, longer than a kernel takes for few moments.
+On a CPU, Warp takes 12 µs to pack the arguments of a launch. For few moments this is longer than the kernel itself, so
+repeated launches reuse packed arguments, and pack only those that differ.
 """
 
 from collections.abc import Sequence
