@@ -126,10 +126,10 @@ def _watch_body(m: Monitor, bodies: BodyView, body: int, substep: int, dt: float
     speed = wp.length(wp.spatial_top(bodies.qd[body]))
     # an angular velocity whose square overflows leaves an orientation of zero
     has_orientation = wp.length(wp.transform_get_rotation(bodies.q[body])) >= 0.5
-    is_lost = bodies.inv_mass[body] > 0.0 and speed > wp.static(HIGHEST_SPEED)  # keys may move a body to anywhere
+    thickness = m.thickness[body]
+    is_lost = thickness < wp.inf and speed > wp.static(HIGHEST_SPEED)  # keys may move a body to anywhere
     if not wp.isfinite(total) or not has_orientation or is_lost:
         wp.atomic_min(m.counts, COUNT_BAD_BODY, (m.substeps[0] + wp.max(substep, 0)) * bodies.qd.shape[0] + body)
-    thickness = m.thickness[body]
     if thickness < wp.inf:
         turning = m.reach[body] * wp.length(wp.spatial_bottom(bodies.qd[body]))
         weighted_time = UNCONSTRAINED_WEIGHT * dt
