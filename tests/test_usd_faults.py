@@ -7,12 +7,14 @@ import sys
 import warnings
 
 import newton
+import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom
 
 from warpmag import Simulation
 from warpmag.engine.stepping.scene import import_scene
 from warpmag.errors import InputError, SimulationError
+from warpmag.kernels.rigid.monitor import HIGHEST_SPEED
 from warpmag.usd import check, newton_errors, open_stage, read_magnets, stage_clock, survey
 from warpmag.usd.values import _DECLARED
 
@@ -500,6 +502,18 @@ def test_a_run_that_ends_names_what_pulled(device, tmp_path, monkeypatch):
     with pytest.raises(SimulationError, match="/Ball has left; the ends of the joint /Joint were apart at the start"):
         simulation.step()
         assert simulation.state
+
+
+def test_keys_may_move_a_body_at_any_speed(device, tmp_path):
+    """An animator hides a magnet by a key far away; a body that forces move would end the run at this speed."""
+    body = ball(
+        "bool physics:kinematicEnabled = 1",
+        "double3 xformOp:translate.timeSamples = {0: (0, 0, 0), 1: (0, 1e6, 0)}",
+        'uniform token[] xformOpOrder = ["xformOp:translate"]',
+    )
+    simulation = Simulation(write(tmp_path, body), device=device)
+    simulation.step()
+    assert np.linalg.norm(simulation.state.body_qd.numpy()[0, :3]) > HIGHEST_SPEED
 
 
 def test_a_point_instancer_as_a_collider_of_a_magnet(tmp_path):
