@@ -8,12 +8,14 @@ from dataclasses import replace
 import magpylib
 import numpy as np
 import pytest
+import warp as wp
 
 import warpmag
 from bench import iron
 from bench.reference.iron_bodies import SETUPS, Body, Setup, load
 from bench.reference.oracle import MU0
 from tests.cell_bodies import demagnetizing_matrix
+from warpmag.kernels.applied import near_cells
 from warpmag.shapes import cylinder_potential, demagnetization, lattice
 from warpmag.shapes.face_charges import face_response
 from warpmag.shapes.linear_cells import with_slopes
@@ -31,6 +33,22 @@ def with_magnet(plate: Body, shift, gap: float, magnetization=ALONG) -> Setup:
     """Return a plate below a magnet of 20 × 5 mm with a shift [m] along x and y, and a gap [m] above z = 0."""
     center = (*shift, gap + 0.0025)
     return Setup((plate, Body("cylinder", (0.01, 0.0025), center, 0.0, magnetization=magnetization)))
+
+
+@pytest.mark.parametrize(("along", "across"), [(1e-3, 1e-3), (0.5, 0.05), (0.9, 0.9), (0.02, 0.1)])
+@pytest.mark.parametrize("depth", [0.02, 0.4, 5.0])
+def test_charges_on_a_plate_reflect_a_wave(along, across, depth):
+    """The potential is continuous at both faces of the plate, and so is the flux: four equations."""
+    k = np.pi  # half a period on a unit length
+    inner, flux = k * np.sqrt(across / along), np.sqrt(1.0 / (along * across))  # decay, and flux over that in air
+    down, up = np.exp(inner * -depth), np.exp(inner * depth)
+    # φ is exp(kz) + r exp(−kz) above, a exp(inner z) + b exp(−inner z) inside, t exp(k(z + depth)) below
+    equations = np.array([
+        [1.0, -1.0, -1.0, 0.0], [-1.0, -flux, flux, 0.0], [0.0, down, up, -1.0], [0.0, flux * down, -flux * up, -1.0],
+    ])  # fmt: skip
+    reflected = np.linalg.solve(equations, [-1.0, -1.0, 0.0, 0.0])[0]
+    values = (wp.float64(value) for value in (along, across, depth))
+    assert float(near_cells._image_factor(*values)) == pytest.approx(-reflected, rel=1e-6)
 
 
 @pytest.mark.parametrize("magnetization", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0)], ids=["along", "across"])
