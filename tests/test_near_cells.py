@@ -51,6 +51,29 @@ def test_charges_on_a_plate_reflect_a_wave(along, across, depth):
     assert float(near_cells._image_factor(*values)) == pytest.approx(-reflected, rel=1e-6)
 
 
+def test_a_sheet_of_weak_iron_is_pulled_as_its_parts(device):
+    """Parts of low susceptibility hardly act on each other. The faces of 0.1 mm would have too many charges by half."""
+    chi, gap, step = 0.5, 1e-4, 5e-6
+    edges = np.concatenate(
+        [np.linspace(0.0, 8e-3, 41), np.linspace(8e-3, 12e-3, 81)[1:], np.linspace(12e-3, 2e-2, 41)[1:]]
+    )
+    middles, widths = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
+    places = np.stack(np.meshgrid(middles, middles, [-2.5e-5, 2.5e-5], indexing="ij"), -1)
+
+    def energy(height):
+        magnet = magpylib.magnet.Cylinder(
+            magnetization=ALONG, dimension=(0.02, 0.005), position=(0.0, 0.0, height + 0.00255)
+        )
+        squares = magnet.getH(places) ** 2
+        responses = chi * squares[..., :2].sum(axis=-1) + chi / (1.0 + chi) * squares[..., 2]
+        return -0.5 * MU0 * np.einsum("i,j,ijk->", 2.0 * widths, 2.0 * widths, responses) * 5e-5
+
+    expected = -(energy(gap + step) - energy(gap - step)) / (2.0 * step)
+    sheet = Body("box", (0.02, 0.02, 5e-5), (0.0, 0.0, -5e-5), chi)
+    forces, _, _ = iron.model_forces(with_magnet(sheet, (0.0, 0.0), gap), 0, device, "dipole")
+    assert forces[1, 2] == pytest.approx(expected, rel=0.06)
+
+
 @pytest.mark.parametrize("magnetization", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0)], ids=["along", "across"])
 @pytest.mark.parametrize(("radius", "half_height"), [(0.01, 0.0025), (1e-3, 5e-5), (0.002, 0.02)])
 def test_tables_interpolate_the_field_around_cylinders(radius, half_height, magnetization):
