@@ -220,12 +220,12 @@ def _image_factor(along: Any, across: Any, depth: Any):
     ``along`` and ``across`` are 1/μ of the plate along its magnetization and perpendicular to it. The source varies
     along the magnetization as a wave of half a period on a length l, and the plate has the thickness ``depth`` l.
     """
-    one, wave = type(along)(1.0), type(along)(-2.0 * wp.pi)
+    unit, wave = type(along)(1.0), type(along)(-2.0 * wp.pi)
     mean = wp.sqrt(along * across)
-    face = (one - mean) / (one + mean)
+    face = (unit - mean) / (unit + mean)
     # factor of the wave after its way to the other face and back
     echo = wp.exp(wave * depth * wp.sqrt(across / along))
-    return face * (one - echo) / (one - face * face * echo)
+    return face * (unit - echo) / (unit - face * face * echo)
 
 
 @cache
