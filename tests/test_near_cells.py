@@ -8,12 +8,14 @@ from dataclasses import replace
 import magpylib
 import numpy as np
 import pytest
+import warp as wp
 
 import warpmag
 from bench import iron
 from bench.reference.iron_bodies import SETUPS, Body, Setup, load
 from bench.reference.oracle import MU0
 from tests.cell_bodies import demagnetizing_matrix
+from warpmag.kernels.applied import near_cells
 from warpmag.shapes import cylinder_potential, demagnetization, lattice
 from warpmag.shapes.face_charges import face_response
 from warpmag.shapes.linear_cells import with_slopes
@@ -31,6 +33,45 @@ def with_magnet(plate: Body, shift, gap: float, magnetization=ALONG) -> Setup:
     """Return a plate below a magnet of 20 × 5 mm with a shift [m] along x and y, and a gap [m] above z = 0."""
     center = (*shift, gap + 0.0025)
     return Setup((plate, Body("cylinder", (0.01, 0.0025), center, 0.0, magnetization=magnetization)))
+
+
+@pytest.mark.parametrize(("along", "across"), [(1e-3, 1e-3), (0.5, 0.05), (0.9, 0.9), (0.02, 0.1)])
+@pytest.mark.parametrize("depth", [0.02, 0.4, 5.0])
+def test_charges_on_a_plate_reflect_a_wave(along, across, depth):
+    """The potential is continuous at both faces of the plate, and so is the flux: four equations."""
+    k = np.pi  # half a period on a unit length
+    inner, flux = k * np.sqrt(across / along), np.sqrt(1.0 / (along * across))  # decay, and flux over that in air
+    down, up = np.exp(inner * -depth), np.exp(inner * depth)
+    # φ is exp(kz) + r exp(−kz) above, a exp(inner z) + b exp(−inner z) inside, t exp(k(z + depth)) below
+    equations = np.array([
+        [1.0, -1.0, -1.0, 0.0], [-1.0, -flux, flux, 0.0], [0.0, down, up, -1.0], [0.0, flux * down, -flux * up, -1.0],
+    ])  # fmt: skip
+    reflected = np.linalg.solve(equations, [-1.0, -1.0, 0.0, 0.0])[0]
+    values = (wp.float64(value) for value in (along, across, depth))
+    assert float(near_cells._image_factor(*values)) == pytest.approx(-reflected, rel=1e-6)
+
+
+def test_a_sheet_of_weak_iron_is_pulled_as_its_parts(device):
+    """Parts of low susceptibility hardly act on each other. The faces of 0.1 mm would have too many charges by half."""
+    chi, gap, step = 0.5, 1e-4, 5e-6
+    edges = np.concatenate(
+        [np.linspace(0.0, 8e-3, 41), np.linspace(8e-3, 12e-3, 81)[1:], np.linspace(12e-3, 2e-2, 41)[1:]]
+    )
+    middles, widths = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
+    places = np.stack(np.meshgrid(middles, middles, [-2.5e-5, 2.5e-5], indexing="ij"), -1)
+
+    def energy(height):
+        magnet = magpylib.magnet.Cylinder(
+            magnetization=ALONG, dimension=(0.02, 0.005), position=(0.0, 0.0, height + 0.00255)
+        )
+        squares = magnet.getH(places) ** 2
+        responses = chi * squares[..., :2].sum(axis=-1) + chi / (1.0 + chi) * squares[..., 2]
+        return -0.5 * MU0 * np.einsum("i,j,ijk->", 2.0 * widths, 2.0 * widths, responses) * 5e-5
+
+    expected = -(energy(gap + step) - energy(gap - step)) / (2.0 * step)
+    sheet = Body("box", (0.02, 0.02, 5e-5), (0.0, 0.0, -5e-5), chi)
+    forces, _, _ = iron.model_forces(with_magnet(sheet, (0.0, 0.0), gap), 0, device, "dipole")
+    assert forces[1, 2] == pytest.approx(expected, rel=0.06)
 
 
 @pytest.mark.parametrize("magnetization", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0)], ids=["along", "across"])

@@ -178,7 +178,20 @@ def _assembled_setups() -> dict[str, Setup]:
     return setups
 
 
-SETUPS = _axial_setups() | _solid_setups() | _letter_setups() | _assembled_setups()
+def _saturated_setups() -> dict[str, Setup]:
+    """Magnets on plates that they saturate, of measured steels: material and thickness [mm] of a plate, and magnet."""
+    setups = {}
+    for material, thickness, magnet in (
+        (CURVE, 0.5, (20.0, 5.0)), (CURVE, 0.5, (10.0, 3.0)), (CURVE, 1.0, (20.0, 20.0)), (CURVE, 1.5, (20.0, 5.0)),
+        ("M-19", 1.0, (20.0, 5.0)), ("430-stainless", 1.0, (20.0, 5.0)), ("430-stainless", 3.0, (30.0, 15.0)),
+    ):  # fmt: skip
+        plate = _cylinder(80.0 if magnet[0] > 10.0 else 50.0, thickness, 0.0, material=material)
+        name = f"magnet {magnet[0]:g} x {magnet[1]:g} on {material} {thickness:g}, gap 0.02"
+        setups[name] = Setup((plate, _cylinder(*magnet, thickness + 0.02, **_magnet())))
+    return setups
+
+
+SETUPS = _axial_setups() | _solid_setups() | _letter_setups() | _assembled_setups() | _saturated_setups()
 """Setups by name."""
 
 

@@ -27,6 +27,9 @@ sides of a cell. At a distance of one side both differ by 2 to 3 %."""
 STEEP_REACH = 1.5, 2.5
 """The same distances for the difference of the field between the halves of a cell. With 4 and 6 sides forces change by
 at most 2 %, and a step with a magnet 5 mm over a plate takes twice the time."""
+_THICK = 1e3
+"""Depth of cells that have another cell behind each outer face, over the longest side of a face."""
+_LEAST_INVERSE_PERMEABILITY = 1e-6
 
 
 class NearCellBody(NamedTuple):
@@ -51,10 +54,11 @@ def cell_arrays_type(dtype):
         neighbor: wp.array2d[int]  # index of the neighbor on each side, less that of the cell, shape [rows, 6]
         weight: wp.array2d[dtype]  # weights of a cell and of its neighbors in its differences, shape [rows, 12]
         layer: wp.array2d[dtype]  # factors of differences across layers (``shared/layer.h``), shape [rows, 3]
+        depth: wp.array[dtype]  # depth behind a face over its longest side, ``_THICK`` unless the body ends behind
         # Cells, shape [cells]:
         row: wp.array[int]  # row of the cell in the arrays of shapes
         cell: wp.array[wp.vec4i]  # moment, index of its body in ``rotation``, range of permanent bodies
-        factor: wp.array[dtype]  # (μ − 1)/(μ + 1) of near cells at the last forces
+        factor: wp.array[dtype]  # of the charges on faces of near cells at the last forces (:func:`_image_factor`)
         active: wp.array[int]  # on a GPU the number of cells that are evaluated, then these; None for all
         # Bodies, shape [bodies]:
         rotation: wp.array[quaternion]  # from each body's frame to the world
@@ -144,6 +148,7 @@ def _table(coupling, kind: int, scalar) -> dict[str, np.ndarray]:
         "neighbor": (coupling.neighbor - np.arange(count)[:, None]).astype(np.int32),
         "weight": coupling.weights.astype(scalar),
         "layer": coupling.layer.astype(scalar),
+        "depth": _depths(coupling.outer_faces, coupling.cell_sides).astype(scalar),
     }
 
 
@@ -157,6 +162,15 @@ def _points_of(tables: Sequence[dict[str, np.ndarray]]) -> np.ndarray:
             form[form[:, 0] == outer, 2:] = first, parts[-1].shape[1]
         first += parts[-1].size
     return np.concatenate([part.ravel() for part in parts])
+
+
+def _depths(outer_faces: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    """Return the depths of cells behind their outer faces, over the longest side of the face, shape [n].
+
+    Cells end there only in layers of one cell.
+    """
+    of_layer = sides / np.array([max(sides[k - 2], sides[k - 1]) for k in range(3)])
+    return np.where(outer_faces.reshape(-1, 3, 2).all(axis=2), of_layer, _THICK).min(axis=1)
 
 
 def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solids, solid_ranges, dtype, device, copies=1):
@@ -191,7 +205,7 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solids, so
     sizes = np.array([len(table["form"]) for table in tables])
     counts, begins = sizes[kind], (np.cumsum(sizes) - sizes)[kind]
     points = _points_of(tables)
-    types = {"form": wp.vec4i, "half": dtype, "neighbor": wp.int32, "weight": dtype, "layer": dtype}
+    types = {"form": wp.vec4i, "half": dtype, "neighbor": wp.int32, "weight": dtype, "layer": dtype, "depth": dtype}
     for name, warp_type in types.items():
         setattr(arrays, name, put(np.concatenate([table[name] for table in tables]), warp_type))
     firsts = np.array([body.first for body in used])
@@ -222,6 +236,28 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solids, so
     arrays.potential = wp.empty(count * 6 * FACE_POINTS, dtype=dtype, device=device)
 
 
+@wp.func
+def _inverse_permeability(slope: Any):
+    """Return 1/μ from the slope 3χ/(3 + χ) of a ball, at least :data:`_LEAST_INVERSE_PERMEABILITY`."""
+    inverse = (type(slope)(3.0) - slope) / (type(slope)(3.0) + type(slope)(2.0) * slope)
+    return wp.max(inverse, type(slope)(_LEAST_INVERSE_PERMEABILITY))
+
+
+@wp.func
+def _image_factor(along: Any, across: Any, depth: Any):
+    """Return the charge on a plate in front of a source, over that on an ideally permeable one.
+
+    ``along`` and ``across`` are 1/μ of the plate along its magnetization and perpendicular to it. The source varies
+    along the magnetization as a wave of half a period on a length l, and the plate has the thickness ``depth`` l.
+    """
+    unit, wave = type(along)(1.0), type(along)(-2.0 * wp.pi)
+    mean = wp.sqrt(along * across)
+    face = (unit - mean) / (unit + mean)
+    # factor of the wave after its way to the other face and back
+    echo = wp.exp(wave * depth * wp.sqrt(across / along))
+    return face * (unit - echo) / (unit - face * face * echo)
+
+
 @cache
 def _image_factor_kernel(dtype):
     cells_struct, vec3 = cell_arrays_type(dtype), wp.types.vector(3, dtype)
@@ -246,15 +282,15 @@ def _image_factor_kernel(dtype):
         i = cells.cell[c][0]
         k, volume = slope[i], dtype(4.18879020478639) * radii[i] * radii[i] * radii[i]
         reduced = wp.length(moments[i]) / (volume * saturation[i])
-        s = inverse_curve_ratio(reduced, k, curve[i], tables) * reduced
-        steep = k * curve_slope(s, k, curve[i], tables)
-        cells.factor[c] = steep / (dtype(2.0) + steep / dtype(3.0))
+        ratio = inverse_curve_ratio(reduced, k, curve[i], tables)
+        along = _inverse_permeability(k * curve_slope(ratio * reduced, k, curve[i], tables))
+        cells.factor[c] = _image_factor(along, _inverse_permeability(k / ratio), cells.depth[cells.row[c]])
 
     return write_image_factors
 
 
 def launch_image_factors(launch, arrays, moments, radii, material):
-    """Write the factor (μ − 1)/(μ + 1) of the charges on faces of near cells, for their differential permeability μ.
+    """Write the factors of the charges on faces of near cells, for the permeabilities at their magnetizations.
 
     Args:
         launch: The ``RecordedLaunches`` of the caller.
