@@ -88,7 +88,7 @@ def _images(operator: np.ndarray, coupling: Coupling) -> tuple[int, np.ndarray]:
     whole = product(vector)
     for axis in range(3):
         signs = np.where(np.arange(3) == axis, -1.0, 1.0)
-        distance, image = tree.query(place * signs)
+        distance, image = map(np.asarray, tree.query(place * signs))
         if distance.max() > _SYMMETRIC * radii.min() or not np.allclose(radii[image], radii, rtol=_SYMMETRIC):
             continue
         change = product(vector[image] * signs) - whole[image] * signs
