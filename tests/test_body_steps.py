@@ -34,8 +34,9 @@ STROKE, OTHER, FOOT = (
     ((0.006, 0.002, 0.002), (0.0, 0.010, 0.0)),
     ((0.004, 0.002, 0.002), (0.006, -0.006, 0.0)),
 )
-BODIES = {  # boxes, and the bits of the mirrors: of a block, a letter T, a foot on the T, and boxes above each other
+BODIES = {  # boxes, and the bits of the mirrors: of a block, a rod, a letter T, a foot on the T, boxes above each other
     "block": ([STROKE], 0b111),
+    "rod of one cell across": ([((0.008, 0.0005, 0.0005), (0.0, 0.0, 0.0))], 0b111),  # no cell has parity 0b110
     "T": ([STROKE, OTHER], 0b101),
     "T with a foot": ([STROKE, OTHER, FOOT], 0b100),
     "none": ([STROKE, ((0.003, 0.002, 0.002), (0.003, 0.010, 0.002)), FOOT], 0),

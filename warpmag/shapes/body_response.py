@@ -129,5 +129,7 @@ def _largest_eigenvalue(matrix: np.ndarray) -> float:
     for _ in range(_POWERS):
         vector = matrix @ vector
         norm = float(np.linalg.norm(vector))
+        if norm == 0.0:  # no cell has a component of the parity
+            break
         vector /= norm
     return norm
