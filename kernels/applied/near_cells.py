@@ -227,7 +227,12 @@ def lay_out(arrays, bodies: Sequence[NearCellBody | None], rotations, solids, so
     ends = np.cumsum([len(potential) for potential in potentials])
     arrays.cylinder = put([end - len(p) if len(p) else -1 for end, p in zip(ends, potentials, strict=True)])
     arrays.cylinders = put(np.concatenate(potentials), dtype)
-    count, vec3 = copies * len(cells), wp.types.vector(3, dtype)
+    _allocate(arrays, copies * len(cells), dtype, device)
+
+
+def _allocate(arrays, count: int, dtype, device):
+    """Allocate the results of ``count`` cells in the struct ``arrays``."""
+    vec3 = wp.types.vector(3, dtype)
     arrays.wrench = wp.empty((count, 6), dtype=dtype, device=device)
     arrays.near, arrays.factor, arrays.change, arrays.steepness = (
         wp.zeros(count, dtype=kind, device=device) for kind in (wp.int32, dtype, vec3, vec3)

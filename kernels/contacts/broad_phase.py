@@ -164,7 +164,7 @@ def launch_find_shape_pairs(search: PairSearch) -> None:
     arrays = search.arrays
     _launch("place_targets", search, 1)
     if arrays.radius.shape[0]:
-        neighbors.launch_find_neighbors(arrays.lists, arrays.lists)
+        neighbors.launch_find_neighbors(arrays.lists, arrays.lists, wp.launch)
     _launch("find_pairs", search, search.group)
 
 

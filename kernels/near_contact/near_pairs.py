@@ -352,7 +352,7 @@ def launch_find_pairs(buffers: NearContactBuffers):
         return
     with _on_side_stream(buffers):
         _launch(buffers, "Positions", 0, 1)
-        neighbors.launch_find_neighbors(buffers.lists, buffers.lists)
+        neighbors.launch_find_neighbors(buffers.lists, buffers.lists, wp.launch)
         _launch(buffers, "Pairs", 0, 2)
 
 

@@ -138,7 +138,7 @@ def _launch(launch, call: str, targets, sources, dim: int = 1, most: int = 0):
     launch(kernel, dim, inputs=[threads, members, targets, sources], **options)
 
 
-def launch_find_neighbors(targets, sources, launch=wp.launch):
+def launch_find_neighbors(targets, sources, launch):
     """List the sources near each target, if a target has moved too far since the last search.
 
     ``targets`` holds the reach of both sets, ``sources`` the hash table. If both are the same, a moment is not its own
