@@ -34,10 +34,8 @@ from warpmag.kernels.shared.team import launch_passes, threads_for
 FOLD, WRITE_WEIGHTS, MULTIPLY, UNFOLD = range(4)  # the passes, in order; as in ``body_steps.h``
 _CONTACT = 0.2
 """Twice the volume over its own that a cell's ball shares with balls of bodies in contact, up to which e is 0."""
-_MEMBERS = 8
-"""Bodies with the same tables that threads of a GPU compute together."""
-_FEW_THREADS = 2
-"""Threads of a GPU that share an orbit of such bodies: a warp reads neighboring words of the table."""
+_MEMBERS = 4
+"""Bodies with the same tables that threads of a GPU compute together: the sums of 8 do not fit into its registers."""
 _ENTRY = 9 * CHUNK
 """Words of a table for a pair of sources and CHUNK targets; as in ``body_steps.h``."""
 _PRODUCTS_PER_THREAD = 200_000
@@ -124,15 +122,17 @@ class BodySteps:
         state.h_change = wp.zeros_like(state.h)
         steps.rotation, steps.state = rotations, state
         self._lay_out(bodies, worlds, kinds.values(), members, device)
-        group = _FEW_THREADS if is_shared else group_threads(device)
-        products = sum(response.tables.size // 9 for _, _, response in bodies)
-        threads, kernel = threads_for(products, _PRODUCTS_PER_THREAD), _kernel(dtype, members, group)
+        threads = threads_for(sum(response.tables.size // 9 for _, _, response in bodies), _PRODUCTS_PER_THREAD)
         orbits = CHUNK * len(steps.body_chunk)
         items = orbits, len(steps.body), CHUNK * len(steps.part_chunk), orbits
         ranges = [(k, k) for k in range(UNFOLD + 1)] if device.is_cuda else [(FOLD, UNFOLD)]
+        per_orbit = 1 if is_shared else group_threads(device)  # many bodies have orbits for all threads
+        per_body = group_threads(device, long_lists=True)
         self._launches = []
         for first, last in ranges:
+            group = per_body if first == WRITE_WEIGHTS else per_orbit
             sizes = dict(device=device, threads=threads, gpu_threads=group * items[first])
+            kernel = _kernel(dtype, members, group)
             self._launches.append(launch_passes(kernel, first, last + 1, steps, record_cmd=True, **sizes))
 
     def _lay_out(self, bodies, worlds, kinds, members: int, device):
