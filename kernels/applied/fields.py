@@ -276,6 +276,8 @@ class AppliedForces(AppliedField):
         solids, ranges = self.sources.solids_of_copy, sources.bodies_of(self._worlds)
         near_cells.lay_out(cells, bodies, rotations, solids, ranges, sources.dtype, self.device, copies)
         cells.movable, cells.forces, cells.torques = self.movable, forces, torques
+        for name in ("near", "near_x", "near_y", "near_z"):
+            setattr(self.arrays.targets, name, wp.zeros_like(self.field))
         self.cell_count = cells.cell.shape[0]
         first_copy = cells.cell[: self.cell_count // copies].numpy()[:, 0]
         edges = np.searchsorted(first_copy, self._world_edges[: sources.world_count // copies])
