@@ -2,13 +2,13 @@
 
 The residual of a body's moments, r = k H/Ms − s, becomes r + w (Q − 1) r with the inverse Q of the body's own operator
 (``warpmag.shapes.body_response``). The θ dynamics then take their usual step. Q r is the error of a lone body, and
-⟨r, Q r⟩ the square of its energy norm, by which solves end (``theta_step.h``).
+⟨r, Q r⟩ the square of its energy norm, a criterion of convergence (``theta_step.h``).
 
 Q belongs to χ = ∞ without saturation, and to bodies that do not intersect. Q multiplies a mode of eigenvalue λ by 1/λ.
 Saturation and overlap change this eigenvalue to λ' = 1 − d (1 − λ) + e. Here d is the mean of (k/3) ‖M‖/(Ms ‖s‖) over
-the body, and e that of 2 k o_i (``theta_flow.py``) beyond contact. The weight w = max(0, (1/λ' − 1)/(1/λ − 1)), with
-the smallest λ of the body, is the largest that is safe for all modes. After a rejected step, w is 0 in the next few
-solves.
+the body. e is the mean of k max(0, 2 o_i − 0.2) with the overlap o_i of ``theta_flow.py``: bodies that only touch have
+2 o_i ≤ 0.2. The weight w = max(0, (1/λ' − 1)/(1/λ − 1)), with the smallest λ of the body, is the largest that is safe
+for all modes. After a rejected step, w is 0 in the next few solves.
 
 Sweeps leave out the pairs within such a body. Letters in contact take half as many evaluations as with sweeps alone. A
 plate on a magnet takes a quarter as many. The elements of Q − 1 are stored as bfloat16, the upper 16 bits of float32:
