@@ -24,7 +24,7 @@ _SCENES = {
     "sakura_tree": "Sakura Tree, 2,500 balls",
 }
 _OWN = ("warpmag", "h_field")  # names of warpmag among the peers
-_PEERS = {"numba_cpu": "a parallel loop in Numba", "warp_tile": "Warp's example of tiles"}
+_PEERS = {"numba_cpu": "a parallel loop in Numba", "warp_tile": "Warp's tile example"}
 """Names of peers for readers who do not know the benchmark; other peers keep theirs."""
 _GPU = "NVIDIA H200"
 """Machine of the quoted figures."""
@@ -126,9 +126,9 @@ def summary(data: Machines) -> str:
             "step of 1 ms of Sakura Tree, 2,500 balls",
             *(_time(_cases(x, "steps", scene="sakura_tree")) for x in data.values()),
         ],
-        ["field of balls on each other, all pairs", *map(_against_peers, data.values())],
+        ["mutual field of balls, all pairs", *map(_against_peers, data.values())],
         ["field of many moments, error at most 1e-3", *map(_many, data.values())],
-        ["solve and forces in many worlds of 64 balls, without rigid bodies", *map(_many_worlds, data.values())],
+        ["solve and forces in many worlds of 64 balls, without rigid-body motion", *map(_many_worlds, data.values())],
     ]
     commits = ", ".join(sorted({lines[0]["commit"] for lines in data.values()}))
     caption = f"*`python -m bench.all`, commit {commits}; [all programs](docs/benchmarks.md).*"

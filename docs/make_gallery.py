@@ -181,8 +181,10 @@ def picture(name: str) -> str:
 def page() -> str:
     """Return the page of the gallery."""
     head = (
-        "# Gallery\n\n`docs/make_gallery.py` runs each scene and example and draws these films by ray tracing.\n"
-        "Stills of scenes are [drawn by Blender](pictures.md).\n\n"
+        "# Gallery\n\n"
+        "`docs/make_gallery.py` runs these scenes and examples and draws films by ray tracing. Two scenes have stills\n"
+        "[drawn by Blender](pictures.md). [Scenes of many balls](howto/many_balls.md) describes the scene `million`."
+        "\n\n"
     )
     entries = [(f"warpmag run {name}", scene_line(name), name) for name in SCENES]
     examples_of = [

@@ -36,7 +36,7 @@ _TARGETS_PER_THREAD, _BALLS_PER_THREAD, _CELLS_PER_THREAD = 500, 50, 50
 _PER_ROW, _MOST_ROWS = {OF_TARGETS: 256, OF_BALLS: 8, OF_CELLS: 8}, 64
 """Fewest targets, balls and cells in a row of a reaction, and most rows of a source."""
 _GROUP = 32  # threads of a GPU that share a source, or a row of its reaction
-_CELL_GROUP, _CELL_BLOCK = 8, 64
+_CELL_GROUP, _CELL_BLOCK = 4, 64
 """Threads of a GPU that share a cell, and threads of a block. The registers hold fewer blocks if blocks are larger."""
 
 
@@ -276,6 +276,8 @@ class AppliedForces(AppliedField):
         solids, ranges = self.sources.solids_of_copy, sources.bodies_of(self._worlds)
         near_cells.lay_out(cells, bodies, rotations, solids, ranges, sources.dtype, self.device, copies)
         cells.movable, cells.forces, cells.torques = self.movable, forces, torques
+        for name in ("near", "near_x", "near_y", "near_z"):
+            setattr(self.arrays.targets, name, wp.zeros_like(self.field))
         self.cell_count = cells.cell.shape[0]
         first_copy = cells.cell[: self.cell_count // copies].numpy()[:, 0]
         edges = np.searchsorted(first_copy, self._world_edges[: sources.world_count // copies])

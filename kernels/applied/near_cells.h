@@ -165,30 +165,24 @@ template <class Vectors> CUDA_CALLABLE inline void add_real3(const Vectors& to, 
     put_real3(to, i, real3((const Real*)to.data + 3 * (size_t)i) + v);
 }
 CUDA_CALLABLE inline Real3 first_lane(Vector v) { return {lane_of(v.x, 0), lane_of(v.y, 0), lane_of(v.z, 0)}; }
-// Field of body b at the center of a cell, in all lanes: its closed form, or the field of its moments in the system and
-// the ``correction`` of that field, with the derivatives that the pass over targets has written. The latter if the body
-// is the only source.
+// Field of body b at the center of a cell, in all lanes. The pass over targets has written the field of the only source
+// within its reach.
 template <class Arrays>
-CUDA_CALLABLE inline TargetField center_field(const Arrays& arrays, const Cell& cell, int b, const PermanentBody& body,
-                                              Real3 correction) {
+CUDA_CALLABLE inline TargetField center_field(const Arrays& arrays, const Cell& cell, int b,
+                                              const PermanentBody& body) {
+    const Vector at = body.frame.point_to_body(broadcast(cell.center));
+    const Real distance2 = lane_of(box_distance2(body, at), 0), reach2 = body.far_reach * body.far_reach;
+    if (arrays.only.data[arrays.coils.kind.shape[0] + b]
+        && distance2 < Real(0.999) * reach2) { // well within, if rounded
+        auto read = [&](const auto& array) {
+            return broadcast(real3((const Real*)array.data + 3 * (size_t)cell.moment));
+        };
+        return {read(arrays.targets.near), read(arrays.targets.near_x), read(arrays.targets.near_y),
+                read(arrays.targets.near_z)};
+    }
     const Number zero = Number(Real(0)), radius = zero + cell.radius;
-    const bool only = arrays.only.data[arrays.coils.kind.shape[0] + b];
-    TargetField f = target_field(
-        only ? INVERSE_4PI * lattice_field(arrays, body, broadcast(cell.center), radius, zero == 0, share(), SHARES)
-             : body.frame.to_world(closed_form(body, body.frame.point_to_body(broadcast(cell.center)),
-                                               Real(0.25) * radius * radius, share(), SHARES)));
-    f = {group_sums(f.h), group_sums(f.x), group_sums(f.y), group_sums(f.z)};
-    if (!only) return f;
-    auto along = [&](const auto& array) { return broadcast(real3((const Real*)array.data + 3 * (size_t)cell.moment)); };
-    f.h += broadcast(correction), f.x += along(arrays.targets.along_x);
-    f.y += along(arrays.targets.along_y), f.z += along(arrays.targets.along_z);
-    return f;
-}
-// A field at the center of a cell without the external field.
-template <class Arrays, class Field>
-CUDA_CALLABLE inline Real3 without_base(const Arrays& arrays, const Cell& cell, const Field& field) {
-    const size_t at = 3 * (size_t)cell.moment;
-    return real3((const Real*)field.data + at) - real3((const Real*)arrays.targets.base.data + at);
+    return group_sums(
+        target_field(body.frame.to_world(closed_form(body, at, Real(0.25) * radius * radius, share(), SHARES))));
 }
 
 // Half the difference of a body's field between the halves of a cell along its axes, of the components along them.
@@ -221,7 +215,6 @@ template <class Arrays> CUDA_CALLABLE inline void average_over_cell(const Arrays
     const CellPoints& fine = cell.fine;
     Real* const potential = arrays.cells.potential.data + MOST_OUTER * (size_t)c;
     Real3 field = {0, 0, 0}, acting = field, acting_mean = field, steepness = field;
-    const Real3 correction = without_base(arrays, cell, arrays.targets.field);
     int nearness = FAR_CELL;
     for (int b = cell.first; b < cell.last; ++b) {
         const PermanentBody body = body_at(arrays, b);
@@ -242,8 +235,7 @@ template <class Arrays> CUDA_CALLABLE inline void average_over_cell(const Arrays
                 put(potential + k, (nearness == NEAR_CELL ? numbers(potential + k) : 0 * phi) + fade.fine.weight * phi);
         }
         const Real3 average = cell.to_world(total_of(means));
-        const Real3 change =
-            fade.fine.weight * (average - first_lane(center_field(arrays, cell, b, body, correction).h));
+        const Real3 change = fade.fine.weight * (average - first_lane(center_field(arrays, cell, b, body).h));
         field += change;
         steepness += fade.fine.weight * total_of(differences);
         if (acts) acting += change, acting_mean += fade.fine.weight * average, nearness = NEAR_CELL;
@@ -365,9 +357,7 @@ CUDA_CALLABLE inline void add_cell_wrench(const Arrays& arrays, const Cell& cell
     const Real* const potential = arrays.cells.potential.data + MOST_OUTER * (size_t)c;
     const Real3 responding = along - response_moment(cell, potential); // potentials lack the average field
     const Wrench w = wrench_on_charges(cell, body, cylinder, cell.fine, responding, difference, potential);
-    const Real3 change = real3((const Real*)arrays.cells.change.data + 3 * (size_t)c);
-    const Real3 correction = without_base(arrays, cell, arrays.targets.acting) - change;
-    const TargetField at_center = center_field(arrays, cell, b, body, correction);
+    const TargetField at_center = center_field(arrays, cell, b, body);
     const Real3 h = first_lane(at_center.h), f = first_lane(gradient_dot(at_center, broadcast(m)));
     add(fade.fine, total_of(w.force) - f, total_of(w.torque) - cross(m, h), total_of(w.energy) + dot(m, h));
 }

@@ -80,7 +80,7 @@ template <bool POINTS, class Arrays> CUDA_CALLABLE inline void field_at_targets(
     const int offset = row % CHUNK, lane_count = chunk[1] - offset, i = chunk[0] + offset;
     if (lane_count <= 0) return;
     const Targets at = targets_at(arrays, i, lane_count);
-    TargetField acting = zero_target_field();
+    TargetField acting = zero_target_field(), sum = acting;
     Vector h = acting.h, inside = h, rate = h;
     if constexpr (COILS) {
         const auto& list = arrays.targets.lists.data[row / CHUNK];
@@ -94,8 +94,10 @@ template <bool POINTS, class Arrays> CUDA_CALLABLE inline void field_at_targets(
             const PermanentBody body = body_at(arrays, b);
             const Mask near = within_reach<Arrays>(body, at);
             if (!any(near)) continue;
+            const CurlFreeField whole = near_field(arrays, body, at.x, at.radius, near, share(), SHARES);
             const TargetField field =
-                target_field(field_correction(arrays, body, at.x, at.radius, near, share(), SHARES));
+                target_field(whole - INVERSE_4PI * lattice_field(arrays, body, at.x, at.radius, near, share(), SHARES));
+            if constexpr (CELLS && !POINTS) add_where(near, sum, target_field(whole));
             add_where(near, h, field.h);
             add_where(near & (at.label != body.label), acting, field);
             if constexpr (RATES)
@@ -105,19 +107,24 @@ template <bool POINTS, class Arrays> CUDA_CALLABLE inline void field_at_targets(
                 add_where(near, inside, magnetization_correction(arrays, body, at.x, share(), SHARES));
         }
     h = group_sums(h);
-    acting = {group_sums(acting.h), group_sums(acting.x), group_sums(acting.y), group_sums(acting.z)};
+    acting = group_sums(acting);
+    if constexpr (CELLS && !POINTS) sum = group_sums(sum);
     if constexpr (POINTS) inside = group_sums(inside);
     if constexpr (RATES) rate = group_sums(rate);
     if (share() != 0) return;
     const size_t column = 3 * (size_t)i;
     const Vector base = vectors((Real*)arrays.targets.base.data + column, lane_count);
-    put_vectors((Real*)arrays.targets.field.data + column, lane_count, base + h);
-    put_vectors((Real*)arrays.targets.acting.data + column, lane_count, base + acting.h);
-    put_vectors((Real*)arrays.targets.along_x.data + column, lane_count, acting.x);
-    put_vectors((Real*)arrays.targets.along_y.data + column, lane_count, acting.y);
-    put_vectors((Real*)arrays.targets.along_z.data + column, lane_count, acting.z);
-    if constexpr (POINTS) put_vectors((Real*)arrays.targets.inside.data + column, lane_count, inside);
-    if constexpr (RATES) put_vectors((Real*)arrays.targets.rate.data + column, lane_count, rate);
+    auto put = [=](const auto& array, Vector v) { put_vectors((Real*)array.data + column, lane_count, v); };
+    put(arrays.targets.field, base + h);
+    put(arrays.targets.acting, base + acting.h);
+    put(arrays.targets.along_x, acting.x), put(arrays.targets.along_y, acting.y);
+    put(arrays.targets.along_z, acting.z);
+    if constexpr (CELLS && !POINTS) {
+        put(arrays.targets.near, sum.h), put(arrays.targets.near_x, sum.x);
+        put(arrays.targets.near_y, sum.y), put(arrays.targets.near_z, sum.z);
+    }
+    if constexpr (POINTS) put(arrays.targets.inside, inside);
+    if constexpr (RATES) put(arrays.targets.rate, rate);
 }
 
 // Field that acts on targets, as last evaluated: that of a source that is the only one.

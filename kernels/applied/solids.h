@@ -203,10 +203,10 @@ CUDA_CALLABLE inline CurlFreeField moments_field(const Arrays& arrays, const Per
     return INVERSE_4PI * out;
 }
 
-// Field of a body at targets nearer than its far reach, less the field of its moments in the system, in the world.
+// Field of a body at targets nearer than its far reach, in the world.
 template <class Arrays>
-CUDA_CALLABLE inline CurlFreeField field_correction(const Arrays& arrays, const PermanentBody& body, Vector x,
-                                                    Number radius, Mask mask, int begin, int step) {
+CUDA_CALLABLE inline CurlFreeField near_field(const Arrays& arrays, const PermanentBody& body, Vector x, Number radius,
+                                              Mask mask, int begin, int step) {
     const Vector at = body.frame.point_to_body(x);
     // the form of a cylinder is cheaper than its moments, everywhere
     const Real reach = body.cylinder.radius > 0 ? body.far_reach : body.reach;
@@ -220,8 +220,14 @@ CUDA_CALLABLE inline CurlFreeField field_correction(const Arrays& arrays, const 
         const CurlFreeField summed = moments_field(arrays, body, at, begin, step);
         add_where(apart, field.h, summed.h), add_where(apart, field.t, summed.t);
     }
-    const CurlFreeField far = lattice_field(arrays, body, x, radius, mask, begin, step);
-    return body.frame.to_world(field) - INVERSE_4PI * far;
+    return body.frame.to_world(field);
+}
+// The same, less the field of the body's moments in the system.
+template <class Arrays>
+CUDA_CALLABLE inline CurlFreeField field_correction(const Arrays& arrays, const PermanentBody& body, Vector x,
+                                                    Number radius, Mask mask, int begin, int step) {
+    return near_field(arrays, body, x, radius, mask, begin, step)
+           - INVERSE_4PI * lattice_field(arrays, body, x, radius, mask, begin, step);
 }
 
 // Magnetization of the body less that of its moments' balls, at x.

@@ -21,6 +21,10 @@ CUDA_CALLABLE inline void add_where(Mask mask, TargetField& to, const TargetFiel
     add_where(mask, to.h, s.h), add_where(mask, to.x, s.x);
     add_where(mask, to.y, s.y), add_where(mask, to.z, s.z);
 }
+// Sums over the threads of a group.
+CUDA_CALLABLE inline TargetField group_sums(const TargetField& s) {
+    return {group_sums(s.h), group_sums(s.x), group_sums(s.y), group_sums(s.z)};
+}
 // ∇(m·H)
 CUDA_CALLABLE inline Vector gradient_dot(const TargetField& s, Vector m) {
     return {dot(s.x, m), dot(s.y, m), dot(s.z, m)};

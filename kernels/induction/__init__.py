@@ -10,6 +10,6 @@ May import ``shared``, ``material``, ``pairs`` and ``cells``.
 | submagnetization | baseline dynamics by pairs of submagnetizations |
 | energy | energy in equilibrium |
 | tangent | linear solve at an equilibrium, for gradients |
-| cell_turns | gradients by rotations of bodies of cells |
+| cell_turns | gradients with respect to rotations of bodies of cells |
 | `theta_step.h`, `anderson.h` | choice of a world's next step, and its mixture of iterates |
 """

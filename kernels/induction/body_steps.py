@@ -2,13 +2,13 @@
 
 The residual of a body's moments, r = k H/Ms − s, becomes r + w (Q − 1) r with the inverse Q of the body's own operator
 (``warpmag.shapes.body_response``). The θ dynamics then take their usual step. Q r is the error of a lone body, and
-⟨r, Q r⟩ the square of its energy norm, by which solves end (``theta_step.h``).
+⟨r, Q r⟩ the square of its energy norm, a criterion of convergence (``theta_step.h``).
 
 Q belongs to χ = ∞ without saturation, and to bodies that do not intersect. Q multiplies a mode of eigenvalue λ by 1/λ.
 Saturation and overlap change this eigenvalue to λ' = 1 − d (1 − λ) + e. Here d is the mean of (k/3) ‖M‖/(Ms ‖s‖) over
-the body, and e that of 2 k o_i (``theta_flow.py``) beyond contact. The weight w = max(0, (1/λ' − 1)/(1/λ − 1)), with
-the smallest λ of the body, is the largest that is safe for all modes. After a rejected step, w is 0 in the next few
-solves.
+the body. e is the mean of k max(0, 2 o_i − 0.2) with the overlap o_i of ``theta_flow.py``: bodies that only touch have
+2 o_i ≤ 0.2. The weight w = max(0, (1/λ' − 1)/(1/λ − 1)), with the smallest λ of the body, is the largest that is safe
+for all modes. After a rejected step, w is 0 in the next few solves.
 
 Sweeps leave out the pairs within such a body. Letters in contact take half as many evaluations as with sweeps alone. A
 plate on a magnet takes a quarter as many. The elements of Q − 1 are stored as bfloat16, the upper 16 bits of float32:
@@ -34,10 +34,8 @@ from warpmag.kernels.shared.team import launch_passes, threads_for
 FOLD, WRITE_WEIGHTS, MULTIPLY, UNFOLD = range(4)  # the passes, in order; as in ``body_steps.h``
 _CONTACT = 0.2
 """Twice the volume over its own that a cell's ball shares with balls of bodies in contact, up to which e is 0."""
-_MEMBERS = 8
-"""Bodies with the same tables that threads of a GPU compute together."""
-_FEW_THREADS = 2
-"""Threads of a GPU that share an orbit of such bodies: a warp reads neighboring words of the table."""
+_MEMBERS = 4
+"""Bodies with the same tables that threads of a GPU compute together: the sums of 8 do not fit into its registers."""
 _ENTRY = 9 * CHUNK
 """Words of a table for a pair of sources and CHUNK targets; as in ``body_steps.h``."""
 _PRODUCTS_PER_THREAD = 200_000
@@ -124,15 +122,17 @@ class BodySteps:
         state.h_change = wp.zeros_like(state.h)
         steps.rotation, steps.state = rotations, state
         self._lay_out(bodies, worlds, kinds.values(), members, device)
-        group = _FEW_THREADS if is_shared else group_threads(device)
-        products = sum(response.tables.size // 9 for _, _, response in bodies)
-        threads, kernel = threads_for(products, _PRODUCTS_PER_THREAD), _kernel(dtype, members, group)
+        threads = threads_for(sum(response.tables.size // 9 for _, _, response in bodies), _PRODUCTS_PER_THREAD)
         orbits = CHUNK * len(steps.body_chunk)
         items = orbits, len(steps.body), CHUNK * len(steps.part_chunk), orbits
         ranges = [(k, k) for k in range(UNFOLD + 1)] if device.is_cuda else [(FOLD, UNFOLD)]
+        per_orbit = 1 if is_shared else group_threads(device)  # many bodies have orbits for all threads
+        per_body = group_threads(device, long_lists=True)
         self._launches = []
         for first, last in ranges:
+            group = per_body if first == WRITE_WEIGHTS else per_orbit
             sizes = dict(device=device, threads=threads, gpu_threads=group * items[first])
+            kernel = _kernel(dtype, members, group)
             self._launches.append(launch_passes(kernel, first, last + 1, steps, record_cmd=True, **sizes))
 
     def _lay_out(self, bodies, worlds, kinds, members: int, device):

@@ -1,10 +1,12 @@
-"""Gradients of functions of the fields and the forces of cells, by the poses of their bodies.
+"""Gradients of functions of fields and forces of cells, with respect to the poses of their bodies.
 
-The corrections N of ``cells.couplings`` are constant in the body's frame. With the cotangents η of the cells' fields,
-a small turn δ of the body changes η·N m by δ·Σ_i ((N m)_i × η_i + (N η)_i × m_i), since N is symmetric. Where cells
-of other bodies are near, N includes the tensors of the pairs, and the derivatives of η·N m with moments that turn with
-their bodies are added (``cells.cell_pair_gradients``). Likewise a function of forces and torques has gradients g by
-moments. A turn of a body alone changes it by δ·Σ_i g_i × m_i more than a turn with the moments.
+The corrections N of ``cells.couplings`` are constant in the body's frame. With the cotangents η of the cells' fields, a
+small rotation δ of the body changes η·N m by δ·Σ_i ((N m)_i × η_i + (N η)_i × m_i), since N is symmetric. Where cells
+of other bodies are near, N includes the tensors of the pairs, and the derivatives of η·N m with moments that rotate
+with their bodies are added (``cells.cell_pair_gradients``).
+
+Likewise let g be the gradients of a function of forces and torques with respect to the moments. A rotation δ of a body
+at fixed moments changes the function by δ·Σ_i g_i × m_i more than a rotation of body and moments.
 """
 
 from functools import cache

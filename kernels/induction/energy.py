@@ -7,7 +7,7 @@ The energy of the magnetization curves and of the interactions is
 over inducible moments i in the applied field H0, and permanent moments p in each other's field H_p and the external
 field H_e. Φ' = f⁻¹, so E is minimal in equilibrium. In equilibrium V Φ = m·H − V Ψ(H), with the co-energy Ψ' = f, and
 
-    E = μ0 Σ_i [½ m·(H − H0) − V Ψ(H)]  −  μ0 Σ_p [½ m·H_p + m·H_e],
+    E = μ0 Σ_i [½ m·(H − H0) − V Ψ(H)]  −  μ0 Σ_p [½ m·H_p + m·H_e].
 
 Since E is minimal, its gradient with respect to positions is minus Kelvin's force (Kim and Han 2022, Eqs. 13, 14).
 """

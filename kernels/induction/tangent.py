@@ -4,14 +4,14 @@ The derivative of the curve, f'(H) = k [c' ĥĥᵀ + (c/s) (1 − ĥĥᵀ)] with
 be the root of V f'(H) of each moment, 0 for permanent moments, and T the tensor of the pairs' fields. :class:`Tangent`
 solves (1 − S T S) w = S ρ by conjugate gradients. Each world iterates and converges on its own.
 
-An iteration evaluates the field T S z of one vector z, the residual r. With A z = z − S T S z, direction p and image q
-of the iteration before,
+An iteration evaluates the field T S z of one vector z: the start vector at first, then the residual r. With
+A z = z − S T S z, direction p and image q of the iteration before,
 
     β = −z·q/p·q,   p ← z + β p,   q ← A z + β q,   α = r·z/p·q,   w ← w + α p,   r ← r − α q.
 
-All sums of an iteration are known after its evaluation, also the norm of the next residual. A cold start begins with
-z = S ρ. A warm start begins with the solution of the last solve, which α scales. Similar cotangents, such as those of
-two substeps, then take few iterations.
+All sums of an iteration are known after its evaluation, including the norm of the next residual. A cold start begins
+with z = S ρ. A warm start begins with the solution of the last solve, which α scales. Similar cotangents, such as those
+of two substeps, then take few iterations.
 """
 
 from functools import cache

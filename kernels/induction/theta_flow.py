@@ -42,16 +42,16 @@ with λ = ‖φ (2 − ω₁) r‖/‖φ r‖. In long solves λ is replaced by 
 
 Inside a body of iron, closed loops of magnetization have almost no field. They barely change the residual, and do not
 affect forces or fields outside. So in worlds with bodies of cells the error is measured in the energy norm. Let A =
-max(1, …) be the amplification above, b = k H0/Ms the reduced applied field, and H' the field changed by steps of bodies
-as a whole:
+max(1, …) be the amplification above, b = k H0/Ms the reduced applied field, and H' the field H plus the changes of
+``body_steps.py``:
 
     error = max(‖M − f(H)‖/‖f(H)‖, √(A ⟨M − f(H), M − f(H')⟩/⟨φ s, φ b⟩)).
 
-The energy norm of an error e is √⟨e, r⟩. For bodies with a step as a whole (``body_steps.py``), r' = Q r approximates
-e. For other bodies M − f(H) and M − f(H') are equal. The energy norm of the solution is √⟨s, b⟩. In a long bar along
-the field a slow mode dominates the solution, and the norms of the error are equal. A steel plate of 60 × 60 × 3 mm that
-a magnet lifts takes 2 evaluations per solve. The end of the solve contributes an error of 1e-4 to the force on the
-plate, without the error of the cells.
+The energy norm of an error e is √⟨e, r⟩. For bodies that take steps as a whole (``body_steps.py``), r' = Q r
+approximates e. For other bodies M − f(H) and M − f(H') are equal. The energy norm of the solution is √⟨s, b⟩. In a long
+bar along the field a slow mode dominates the solution, and the error is the same in both norms. A steel plate of
+60 × 60 × 3 mm that a magnet lifts takes 2 evaluations per solve. Ending these solves at ``rtol`` contributes an error
+of 1e-4 to the force on the plate. The error of the cells is not included.
 
 With slow convergence many steps like the last one remain. The factor σ is their geometric series ρ/(1 − ρ), and at
 least 1, with ρ the ratio of ‖φ r‖ to its smallest earlier value. At least half of σ is kept at the next evaluation. The
@@ -61,10 +61,10 @@ compares the estimate with the true error.
 
 **Warm start.** The next solve starts at s̄ + ω r̄ + η Δg, where Δg is the last change of g from solve to solve. Sweeps
 over neighbors precede its first evaluation. The neighbors' field is computed at their present positions. The field of
-all other sources, F = H − H0 − G' M, is extrapolated as F₁ + η (F₁ − F₂) from the last two solves. Both F are those of
-s̄ and ḡ, which are closer to the solution than the last iterate. Each world has its own factor η = ⟨φΔg, φΔg'⟩/‖φΔg'‖²,
-limited to [0, 1]. It is the factor that best predicts the last change Δg from the change Δg' before it. So the start
-follows smooth motion, and ignores noise.
+all other sources, F = H − H0 − G' M, is extrapolated as F₁ + η (F₁ − F₂) from the last two solves. Both F are computed
+from s̄ and ḡ, which are closer to the solution than the last iterate. Each world has its own factor
+η = ⟨φΔg, φΔg'⟩/‖φΔg'‖², limited to [0, 1]. It is the factor that best predicts the last change Δg from the change Δg'
+before it. So the start follows smooth motion, and ignores noise.
 
 The changes Δs_j, Δr_j are kept for the next solve, since the coupling hardly changes. A slow mode, such as that of long
 columns of balls, then costs one evaluation instead of three. Balls Up, where 243 balls jump, takes 1.2 evaluations per

@@ -1,4 +1,4 @@
-"""Iron balls jump to a magnet above them, built with the Python API.
+"""Iron balls jump to a magnet above them, in a scene built with the Python API.
 
 Kim and Han 2022, Fig. 3; ``warpmag run balls_up`` reads the same scene from a stage. There is no friction, so only
 impacts dissipate energy.

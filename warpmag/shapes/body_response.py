@@ -1,15 +1,16 @@
 """Response of a body to a residual of its magnetization, as a whole: the inverse of its own operator.
 
-An induction solve compares the reduced field g of each moment with its dual variable s (``kernels/induction``). A
-lone body of χ = ∞, far from saturation, is solved by s + Q (g − s) with Q = (1 − 3 T V)⁻¹. Here 3 is the initial slope
-k of a ball, T are the tensors between the body's cells, and V their volumes. Among other bodies, Q takes the slow modes
-of the body itself out of the iteration.
+An induction solve compares the reduced field g of each moment with its dual variable s (``kernels/induction``). A lone
+body of χ = ∞, far from saturation, is solved by s + Q (g − s) with Q = (1 − 3 T V)⁻¹. Here 3 is the initial slope k of
+a ball, T are the tensors between the body's cells, and V their volumes. Among other bodies, Q removes the slow modes of
+the body itself from the iteration.
 
 **Mirrors.** Let the cells of a body be symmetric with respect to planes through its center, across m of the axes. Then
-the operator acts separately on magnetizations of each of 2ᵐ parities p: those that each mirror leaves as they are, or
-changes the sign of. A mirror across an axis changes the sign of the component along this axis. The cells that mirrors
-map to each other are an orbit. A magnetization of parity p follows from that of one cell in each orbit. So 2ᵐ matrices
-between orbits replace that between cells. For a plate they have an eighth of the elements.
+the operator acts separately on magnetizations of each of 2ᵐ parities p. A parity is one sign for each mirror: the
+mirror leaves the magnetization unchanged, or reverses it. A mirror across an axis reverses the component along this
+axis. The cells that mirrors map to each other are an orbit. The values at one cell of each orbit determine a
+magnetization of parity p. So 2ᵐ matrices between orbits replace the matrix between cells. For a plate they have an
+eighth of its elements.
 """
 
 from typing import NamedTuple

@@ -7,11 +7,12 @@ D² = ρ² + R² − 2 ρ R c, w = z ∓ h and S = √(D² + w²):
 
     4π G_z = R Σ ± ∫ (R − ρ c) (S − |w|)/D² dφ,    4π G_ρ = −R Σ ± ∫ c arsinh(w/D) dφ.
 
-The first sums the boundary terms of ∫ dA/r over the end faces at z = ±h (divergence theorem), the second integrates 1/r
-along the lines of the curved face. Nodes of the table are a geometric series away from the rim, where derivatives of
-G are infinite. Each node has G, its first derivatives and its mixed derivative. Bicubic Hermite interpolation
-(``kernels/applied/cylinder.h``) is then continuous in its first derivatives, so that forces are derivatives of the
-energy. Its field has an error of 1e-4, and of 1e-1 nearer to the rim than 1/2000 of the smaller of R and h.
+The first integral contains the boundary terms of ∫ dA/r over the end faces at z = ±h (divergence theorem). The second
+is over 1/r along the lines of the curved face. Nodes of the table are a geometric series away from the rim, where
+derivatives of G are infinite. Each node has G, its first derivatives and its mixed derivative. Bicubic Hermite
+interpolation (``kernels/applied/cylinder.h``) is then continuous in its first derivatives, so that forces are
+derivatives of the energy. The field has a relative error of 1e-4. Nearer to the rim than 1/2000 of the smaller of R and
+h, it is 1e-1.
 """
 
 import math

@@ -2,13 +2,13 @@
 
 A lattice (``lattice.py``) divides a solid into cells of uniform magnetization. Fields averaged over cells give the
 operator H_i = −Σ_j N_ij M_j. It is the exact operator restricted to such magnetizations: symmetric and positive, with
-eigenvalues between 0 and 1. Ellipsoids are exact, except for the resolution of their surface. Other bodies take a
-slightly too small moment: a cube of 9³ cells and χ = ∞ takes 3.58 V H0 instead of 3.64 V H0.
+eigenvalues between 0 and 1. Ellipsoids are exact, except for the resolution of their surface. Other bodies have a
+slightly too small moment: a cube of 9³ cells and χ = ∞ has 3.58 V H0 instead of 3.64 V H0.
 
 The tensor of two equal cuboids on a grid is from Newell, Williams and Dunlop, "A generalization of the demagnetizing
 tensor for nonuniform magnetization" (1993), Eqs. 27, 28 and 32. A cell that the surface cuts is resolved by subcells,
-and the tensors of its filled subcells are added. Without subcells, a sphere of any resolution has steps and takes a
-moment 10 % too large.
+and the tensors of its filled subcells are added. Without subcells, a sphere of any resolution has steps, and its moment
+is 10 % too large.
 
 The sums over all pairs treat each cell as a ball (``kernels/pairs/pair_law.py``). A :class:`Coupling` holds the
 correction: for cells nearer than :data:`EXACT_REACH`, the exact tensor minus the tensor of two balls. For a cell

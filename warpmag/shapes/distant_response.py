@@ -1,9 +1,9 @@
-"""Few moments that replace a body of iron while every source of a field keeps a distance from it.
+"""A few moments that replace an iron body while every source of a field is far from it.
 
-Fields of sources beyond a surface around the body are those of charges on that surface. Over the body they vary slowly:
-few combinations of them, F at the cells, span all others up to a tolerance. Let R be the response of the cells to any
-field (``demagnetization.py``), and Q = FᵀRF. Moments at few points with the same fields E there act like the cells up
-to the tolerance if their response P has EᵀPE = Q. With the pseudoinverse E⁺,
+Fields of sources beyond a surface around the body equal fields of charges on that surface. Over the body they vary
+slowly: a few combinations of them, F at the cells, span all others up to a tolerance. Let R be the response of the
+cells to any field (``demagnetization.py``), and Q = FᵀRF. Moments at few points with the same fields E there act like
+the cells up to the tolerance if their response P has EᵀPE = Q. With the pseudoinverse E⁺,
 
     P = E⁺ᵀ Q E⁺ + ε (1 − E E⁺),
 
@@ -13,10 +13,10 @@ curve like cells. Their own field is T = (1/3 − P⁻¹)/V, since a ball of ide
 points are means of cells, so that they are inside the body.
 
 There are several levels, :data:`FEW_LEVELS`: the nearer the surface, the more combinations and points. The distance
-that a body needs follows from the forces of ball magnets whose diameter is their distance from the body, which act as
-dipoles: it is where their error, which falls off with the third power of the distance or faster, is at most
-:data:`BALL_ERROR`. That is the largest error of several places and directions. The median is a fifth of it, and larger
-magnets have less.
+that a body needs follows from the forces on ball magnets around it, which act as dipoles. The diameter of each ball
+equals its distance from the body. At the distance of a level the largest error of these forces, over several places and
+directions, is at most :data:`BALL_ERROR`. It falls with the third power of the distance or faster. The median error is
+a fifth of the largest, and errors for larger magnets are smaller.
 """
 
 import math

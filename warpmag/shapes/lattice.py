@@ -3,9 +3,9 @@
 A body that is not a ball is replaced by moments of volume Vᵢ at xᵢ. ΣVᵢ is the volume of the body, and ΣVᵢxᵢ/ΣVᵢ its
 centroid. Nearly cubic cells divide the bounding box of each shape exactly. The moment of a cell is at the centroid of
 the part that the shape fills. Cells filled by less than a third, or a half in a body of several shapes, join their
-nearest neighbor, so that a curved surface has neither steps nor slivers. The grid of a single mesh fits its steps, such
-as the strokes of a letter, where it can. The filled part is found from a fine grid of test points. Where shapes of a
-body overlap, each test point counts once.
+nearest neighbor, so that a curved surface has neither steps nor slivers. Where possible, the faces of a single mesh,
+such as the sides of the strokes of a letter, lie between cells of its grid. The filled part is found from a fine grid
+of test points. Where shapes of a body overlap, each test point counts once.
 
 The accuracy determines :data:`AUTOMATIC_COUNT`. The table lists errors of a uniformly magnetized cube of side L as n³
 point dipoles. The field's error is a relative L2 norm over all points at distance d from the surface. The force acts on
@@ -29,10 +29,10 @@ by moments at Gauss points (``polyhedra.py``), which are fewer.
 The radius of a moment's ball matters if another ball touches the body. Balls of the moments' own volumes
 (:attr:`Lattice.radii`) protrude from the body by 0.12 a. Averaging over that overlap changes the force by 14 to 22 % (n
 of 12 to 8). Inducible bodies need these balls, because with them the equilibrium is unique. Permanent bodies use balls
-inscribed in the cells (:attr:`Lattice.inner_radii`), so that a touching ball is in the field of the table.
+inscribed in the cells (:attr:`Lattice.inner_radii`), so that the errors in the table hold for a touching ball.
 
 The moments of an inducible body act on each other as parts of cells (``demagnetization.py``), which :class:`Pieces`
-describe. A thin body gets flat cells, so that it has :data:`LEAST_ACROSS` across its thickness.
+describe. A thin body gets flat cells, so that :data:`LEAST_ACROSS` cells span its thickness.
 """
 
 from collections.abc import Sequence

@@ -3,8 +3,8 @@
 The field of such a body is a closed form, a sum over its edges and faces (``kernels/applied/polyhedron.h``). A box is
 exact. A cylinder is a prism of :data:`CYLINDER_SIDES` sides with the cylinder's volume. Its field differs by 1 % of M
 at a twentieth of the radius from the rim's corners, and by 1e-3 at a tenth (``tests/test_close_up.py``). A cylinder
-magnetized along its axis has the exact field (``kernels/applied/axial_cylinder.h``). The prism then serves forces
-between two magnets only.
+magnetized along its axis has the exact field (``kernels/applied/axial_cylinder.h``). For such a magnet the prism is
+used only in forces between two magnets.
 
 Force and torque on a body are integrals over the charges M·n of its faces. Stokes' theorem turns them into line
 integrals of the potentials φ = M·G and a = M×G of the other body, which are continuous everywhere. The force in the

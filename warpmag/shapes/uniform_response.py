@@ -1,11 +1,11 @@
 """Response of a body to uniform fields, from a surface integral, and the correction of its cells.
 
-Cells (``demagnetization.py``, ``linear_cells.py``) take too small a moment: by up to two thirds with one or two uniform
-cells across the strokes of a letter, by up to 5 % with linear ones. The response of an ideally permeable body follows
-from its surface alone, which is at one potential: (1/4π) ∫ σ/‖x − y‖ dA = ψ. In a uniform field H0, ψ = H0·x, and the
-moment is ∫ σ x dA. The charge σ is taken as constant on facets (``facets.py``). The potential of a facet is a closed
-form (Wilton et al., IEEE Trans. Antennas Propag. 32 (1984) 276). The response of the cells is solved directly, or by
-conjugate gradients if there are many.
+Without a correction the moment of the cells (``demagnetization.py``, ``linear_cells.py``) is too small: by up to two
+thirds with one or two uniform cells across the strokes of a letter, by up to 5 % with linear cells. The response of an
+ideally permeable body follows from its surface alone, which is at one potential: (1/4π) ∫ σ/‖x − y‖ dA = ψ. In a
+uniform field H0, ψ = H0·x, and the moment is ∫ σ x dA. The charge σ is taken as constant on facets (``facets.py``). The
+potential of a facet is a closed form (Wilton et al., IEEE Trans. Antennas Propag. 32 (1984) 276). The response of the
+cells is solved directly, or by conjugate gradients if there are many.
 
 Let P be the polarizability of the cells and Q that of the surface. The correction adds a uniform field of C = P⁻¹ − Q⁻¹
 times the moment of the body to all cells. By Woodbury's formula the response to a uniform field becomes Q. Because Q is

@@ -120,8 +120,8 @@ class Magnetics:
                 34 % at a gap of 0.3 radii, by 93 % at 0.01.
             method: Summation of fields and forces: ``direct`` over all pairs, ``fmm`` by the fast multipole method
                 with an error within ``rtol``, or ``auto`` for the faster one.
-            rtol: Relative magnetization error at which the induction solve ends: with bodies of cells, in the energy
-                norm.
+            rtol: Relative magnetization error at which the induction solve ends. With bodies of cells the error in the
+                energy norm and the relative residual must both be at most ``rtol``.
             external_field: Uniform applied field H0 [A/m], world frame. By default the option ``magnetic`` of an
                 imported MJCF, B/μ0, with a warning; else none.
             max_evaluations: Field evaluations after which an unconverged induction solve ends.
@@ -195,8 +195,8 @@ class Magnetics:
     def error(self) -> wp.array:
         """Estimated relative magnetization error of the last solve, on the device, shape [worlds with magnets].
 
-        In worlds with bodies of cells, such as plates and bars, it is the error in the energy norm: closed loops of
-        magnetization inside iron, which have no field, hardly count.
+        In worlds with bodies of cells, such as plates and bars, it is the larger of the error in the energy norm and
+        the relative residual. Closed loops of magnetization inside iron, which have no field, hardly affect either.
         """
         return self.system.error
 
@@ -221,7 +221,7 @@ class Magnetics:
         return self.system.eddy is not None
 
     def magnetic_shapes(self) -> MagneticShapes:
-        """Return the magnets and coils, from whose distances a simulation finds how long substeps may share forces."""
+        """Return the magnets and coils; their distances limit for how long substeps may share forces."""
         radii = self._model.shape_collision_radius.numpy()[self.shapes]
         coils = {k: radius for k, radius in zip(self._sources.shapes, self._sources.radii, strict=True) if radius > 0.0}
         shapes, spacing = [*self.shapes, *coils], self._sources.spacing
@@ -400,7 +400,7 @@ class Magnetics:
     def discard_attempt(self, rejected: wp.array) -> None:
         """Discard what the induction remembers of a step that is repeated, if ``rejected`` is not 0, shape [1].
 
-        Its magnetizations are those of other poses, from which the induction converges slowly.
+        Its magnetizations belong to other poses. Starting from them, the induction would converge slowly.
         """
         for system in self._systems:
             system.restart(rejected)
@@ -431,9 +431,9 @@ class Magnetics:
         factor of its field.
 
         Args:
-            coil: Index of the coil's shape in the model, or a pattern of labels as in a shell. The index is the return
-                value of :func:`warpmag.add_coil`, unless builders were combined. Coils of replicated worlds have the
-                same label, in the order of the worlds.
+            coil: Index of the coil's shape in the model, or a pattern of labels, with wildcards as in a shell. The
+                index is the return value of :func:`warpmag.add_coil`, unless builders were combined. Coils of
+                replicated worlds have the same label, in the order of the worlds.
             ampere_turns: Current times turns [A], one number or shape [coils]. Or a Warp array of float32 on the
                 model's device; its values are not checked.
 
@@ -533,7 +533,7 @@ class Magnetics:
         return probe
 
     def workload(self) -> Workload:
-        """Return the time of each part of a step, and an estimate of it for each body and world.
+        """Return the time of each part of a step, and estimated times of each body and world.
 
         Parts of the last solve, such as neighbor search and field evaluations, are launched again on their own, on a
         GPU in graphs. The time of a body is estimated from its share of moments, of pairs, and of near cells: cells so

@@ -260,7 +260,7 @@ class Simulation:
         return self._statistics
 
     def moments_line(self) -> str:
-        """Return a line with the number of moments and the body that has most of them; solves nothing."""
+        """Return a line with the number of moments and the body that has most of them, without a solve."""
         return moments_line(self._magnetics)
 
     def warnings(self) -> list[str]:
