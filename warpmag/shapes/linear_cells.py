@@ -47,7 +47,7 @@ of the sides of a cell perpendicular to the edge, and κ is :data:`_CURL` or :da
 
 A coupling has entries for near cells only. The fields of differences end where its entries end. An abrupt end would
 give some magnetizations without charges negative energies in compact bodies: the operator of a cylinder of 621 cells
-would have an eigenvalue of -0.0002. So these fields fade over the outer half of the distances, :data:`_FADING`.
+would have an eigenvalue of -0.0008. So these fields fade over the outer half of the distances, :data:`_FADING`.
 """
 
 from dataclasses import replace
@@ -63,7 +63,7 @@ LEAST_CELLS = 65
 """Smallest number of linear cells of a body. Smaller bodies get the response of their surface
 (``uniform_response.py``)."""
 _CURL = 0.001
-"""Demagnetizing factor of the curl. Cylinders side by side at 0.2 mm attract each other 6 % too weakly, and 13 % with
+"""Demagnetizing factor of the curl. Cylinders side by side at 0.2 mm attract each other 1 % too weakly, and 9 % with
 0.004. With 0.0007 three plates of three layers that lie on each other would have an eigenvalue of -0.0002."""
 _LARGE_CURL = 0.004
 """The same in bodies of one or two layers or of several shapes. The fields of the layers almost cancel, and errors of
@@ -72,7 +72,7 @@ evaluations. With 0.002 a hammer of two shapes at an angle would have an eigenva
 _FADING = 0.5, 1.1
 """Distances at which fields of differences start to fade and have ended, over the largest distance of a coupling's
 entries. With 0.45 and 1.05 letters in contact attract each other 0.1 % less, and cylinders side by side
-0.7 % less."""
+0.8 % less."""
 _WITHIN_HALF = 1.0 / 3.0
 """Demagnetizing factor of the linear part within a half, for the difference D M, deep in a body."""
 
