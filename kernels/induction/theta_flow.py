@@ -88,8 +88,9 @@ FLOW_STEP = 0.9
 """Step length over the largest convergent one."""
 _START_THREADS = 256
 """Most threads of a GPU's block at the start of a solve, where a moment takes a group of threads."""
-_RESIDENT_BLOCKS = {wp.float32: (3, 5), wp.float64: (2, 3)}
-"""Blocks of 256 threads per multiprocessor at the start and in sweeps; limits the registers that compilers use."""
+_RESIDENT_BLOCKS = {wp.float32: (3, 5, 2), wp.float64: (2, 3, 1)}
+"""Blocks of 256 threads per multiprocessor at the start, in sweeps and in checks of convergence; limits the registers
+that compilers use."""
 
 
 def _constants(group: int) -> dict:
@@ -160,7 +161,9 @@ def _convergence_kernel(dtype, group: int):
     @wp.func_native("warpmag::choose_step(state, w, &sums[0]);")
     def choose_step(state: state_struct, w: int, sums: columns): ...
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=_options(dtype, group))
+    bounds, options = (256, _RESIDENT_BLOCKS[dtype][2]), _options(dtype, group)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=options, launch_bounds=bounds)
     def check_convergence(state: state_struct):
         c, lane = wp.tid()
         chunk = state.chunk[c]
