@@ -138,11 +138,16 @@ def test_fields_of_halves_are_means_over_the_halves(device):
     assert error < 0.03
 
 
-def test_searches_of_earlier_poses_leave_no_trace(device):
+@pytest.mark.parametrize("crowded", [False, True])
+def test_searches_of_earlier_poses_leave_no_trace(crowded, device, monkeypatch):
     """Fields and forces after a search are the same before and after others: entries of old rows do not act.
 
-    A cell of a pair writes into the row of the other one, and rows of a vector have different lengths.
+    A cell of a pair writes into the row of the other one, and rows of a vector have different lengths. Cells with more
+    candidates than a list holds have no row, but are candidates of others.
     """
+    if crowded:
+        monkeypatch.setattr(cell_pairs, "_SHORTEST_LIST", 128)
+        monkeypatch.setattr(cell_pairs, "_LONGEST_LIST", 128)
     bodies, turn = [FINE, SHEET, SHEET], Rotation.from_rotvec([0.1, 0.05, 0.3])
     system, _ = make_pair(bodies, [(turn, place) for place in np.zeros((3, 3))], device=device)
     rng, count = np.random.default_rng(4), system.count
@@ -163,6 +168,7 @@ def test_searches_of_earlier_poses_leave_no_trace(device):
         again = values(0.0)
         largest = np.abs(first).max(axis=0)
         assert np.all(np.abs(again - first) <= 1e-12 * largest)  # sums in another order
+    assert system.crowded.numpy()[0] == crowded
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])

@@ -207,11 +207,22 @@ def test_cubes_of_any_size(side, device):
 
 
 @pytest.mark.parametrize("gap", [0.0, 1e-4, 5e-4, 2e-3])
-def test_discs_in_line(gap, device):
-    """The prism's rim deviates by 0.2 % of the radius from the cylinder's."""
-    result = force_on_second(device, (*DISC,), (*DISC, (0.0, 0.0, SIDE / 2 + gap)))
+@pytest.mark.parametrize("angle", [0.0, 5.625])
+def test_discs_in_line(gap, angle, device):
+    """Rims are circles: the force does not depend on the angle about the axis, and rounding remains."""
+    turn = tuple(Rotation.from_euler("z", angle, degrees=True).as_quat())
+    result = force_on_second(device, (*DISC,), (*DISC, (0.0, 0.0, SIDE / 2 + gap), turn))
     expected = magnet_pairs.cylinder_force(DISC[1][0], SIDE / 2, SIDE / 2, gap, M, M)
-    np.testing.assert_allclose(result, [0.0, 0.0, expected], atol=3e-3 * abs(expected))
+    np.testing.assert_allclose(result, [0.0, 0.0, expected], atol=1e-5 * abs(expected))
+
+
+@pytest.mark.parametrize(("place", "turn"), [((0.001, 0.0, SIDE / 2 + GAP), UPRIGHT), ((0.001, 0.002, 0.009), TILTED)])
+def test_torque_between_discs(place, turn, device):
+    """The torque has an error of 2e-5 of the force times the radius, as that of magpylib's 20,000 cells."""
+    other = (*DISC, place, turn)
+    _, wrenches = magnets(device, (*DISC,), other)
+    force, torque = magpylib.getFT(reference(*DISC), reference(*other), meshing=20000, eps=1e-7)
+    np.testing.assert_allclose(wrenches[1, 3:], torque, atol=5e-5 * np.linalg.norm(force) * DISC[1][0])
 
 
 POSES = {

@@ -15,43 +15,40 @@ constexpr int EDGE_POINT = 19, FACE_POINT = 7;
 template <class Arrays>
 CUDA_CALLABLE inline Wrench wrench_on_charges(const Arrays& arrays, const PermanentBody& q, const PermanentBody& s,
                                               Real3 center) {
-    const int* const tables = arrays.solids.shape.data + SHAPE_ROW * (size_t)q.shape;
-    const Vector m = broadcast(s.m), m_target = broadcast(q.m);
+    // points on edges and faces, or on rims and ends of a cylinder that has charges on its ends only
+    const int* const points = arrays.solids.shape.data + SHAPE_ROW * (size_t)q.shape + (q.cylinder.radius > 0 ? 13 : 6);
+    const Vector m_target = broadcast(q.m);
     Wrench wrench = zero_wrench();
-    auto potentials = [&](Vector x, Number& phi, Vector& a) { // scalar and vector potential of s, in the frame of q
-        const Vector g = potentials_of(s.solid, s.frame.point_to_body(q.frame.to_world(x) + broadcast(q.frame.origin)));
-        phi = dot(m, g);
-        a = q.frame.to_body(s.frame.to_world(cross(m, g)));
+    auto potentials_at = [&](Vector x) { // of s, in the frame of q
+        const Vector at = s.frame.point_to_body(q.frame.to_world(x) + broadcast(q.frame.origin));
+        const Potentials p = potentials_of(s, at);
+        return Potentials{p.phi, q.frame.to_body(s.frame.to_world(p.a))};
     };
     const Vector center_in_body = q.frame.point_to_body(broadcast(center));
     auto vector_of = [](const Real* rows, int k) {
         return Vector{numbers(rows + k * CHUNK), numbers(rows + (k + 1) * CHUNK), numbers(rows + (k + 2) * CHUNK)};
     };
     const Number negligible = Number(Real(0)) + Real(1e-12) * dot(q.m, q.m);
-    for (int i = tables[6] + WIDTH * share(); i < tables[6] + tables[7]; i += WIDTH * SHARES) {
+    for (int i = points[0] + WIDTH * share(); i < points[0] + points[1]; i += WIDTH * SHARES) {
         const Real* const at = rows_at(arrays.solids.edge_point.data, EDGE_POINT, i);
         const Vector n1 = vector_of(at, 12), n2 = vector_of(at, 15), x = vector_of(at, 0);
         const Number s1 = dot(m_target, n1), s2 = dot(m_target, n2), weight = numbers(at + 18 * CHUNK);
         if (!any((s1 * s1 + s2 * s2 > negligible) & (weight > 0))) continue;
-        Number phi;
-        Vector a;
-        potentials(x, phi, a);
-        const Number a_tangent = dot(a, vector_of(at, 3));
+        const Potentials p = potentials_at(x);
+        const Number a_tangent = dot(p.a, vector_of(at, 3));
         const Vector normal = s1 * vector_of(at, 6) + s2 * vector_of(at, 9);
-        const Vector f = weight * (a_tangent * (s1 * n1 - s2 * n2) - phi * normal);
+        const Vector f = weight * (a_tangent * (s1 * n1 - s2 * n2) - p.phi * normal);
         wrench.force += f;
         wrench.torque += cross(x - center_in_body, f);
     }
-    for (int i = tables[8] + WIDTH * share(); i < tables[8] + tables[9]; i += WIDTH * SHARES) {
+    for (int i = points[2] + WIDTH * share(); i < points[2] + points[3]; i += WIDTH * SHARES) {
         const Real* const at = rows_at(arrays.solids.face_point.data, FACE_POINT, i);
         const Vector n = vector_of(at, 3);
         const Number charge = dot(m_target, n) * numbers(at + 6 * CHUNK);
         if (!any((dot(m_target, n) * dot(m_target, n) > negligible) & (charge != 0))) continue;
-        Number phi;
-        Vector a;
-        potentials(vector_of(at, 0), phi, a);
-        wrench.torque += charge * (a - dot(a, n) * n);
-        wrench.energy += charge * phi;
+        const Potentials p = potentials_at(vector_of(at, 0));
+        wrench.torque += charge * (p.a - dot(p.a, n) * n);
+        wrench.energy += charge * p.phi;
     }
     return {q.frame.to_world(wrench.force), q.frame.to_world(wrench.torque), wrench.energy};
 }

@@ -10,13 +10,16 @@
 
 namespace warpmag {
 
+// γ of a sheet of radius a at the distance rho from its axis, never 0. H_z jumps at the sheet: points on it count as
+// inside, where γ is positive.
+template <class N> CUDA_CALLABLE inline N sheet_gamma(N a, N rho) {
+    const N tiny = number<N>(is_double<N> ? 1e-100 : 1e-6), gamma = (a - rho) / (a + rho);
+    return magnitude(gamma) < tiny ? tiny : gamma;
+}
 // Writes q and the integrals of one end of a thin sheet of current of radius a, at the height z above that end. H_ρ/ρ,
 // H_z, (∂H_ρ/∂z)/ρ and ∂H_z/∂z of 2πb ampere-turns are those of the upper end less those of the lower end.
 template <class N> CUDA_CALLABLE inline void put_sheet_end(N a, N rho, N z, N least2, N& q, Cel<N> (&integrals)[4]) {
-    const N unit = 0 * a + 1, tiny = number<N>(is_double<N> ? 1e-100 : 1e-6);
-    N gamma = (a - rho) / (a + rho);
-    gamma = magnitude(gamma) < tiny ? tiny : gamma; // H_z jumps at the sheet: points on it count as inside
-    const N size = magnitude(gamma), sign = gamma > 0 ? unit : -unit;
+    const N unit = 0 * a + 1, gamma = sheet_gamma(a, rho), size = magnitude(gamma), sign = gamma > 0 ? unit : -unit;
     const LoopPoint<N> at(a, rho, z, least2);
     q = at.q;
     integrals[0] = {-8 * a * a / (at.beta2 * at.beta * (1 + q)), 1 + q, 0 * a, unit};

@@ -9,7 +9,7 @@
 namespace warpmag {
 
 // Numbers of a shape and of a body, as in solids.py; numbers of a moment: position and volume.
-constexpr int SHAPE_ROW = 13, SIZE_ROW = 10, MOMENT_ROW = 4;
+constexpr int SHAPE_ROW = 17, SIZE_ROW = 10, MOMENT_ROW = 4;
 
 // Origin and axes of a body in the world.
 struct Frame {
@@ -126,6 +126,12 @@ CUDA_CALLABLE inline CurlFreeField closed_form(const PermanentBody& body, Vector
                                                int step) {
     if (body.cylinder.radius > 0) return field_of(body.cylinder, at, least2, begin, step);
     return field_of(body.solid, body.m, at, least2, begin, step);
+}
+// Potentials of the closed form of a body at points in its frame.
+CUDA_CALLABLE inline Potentials potentials_of(const PermanentBody& body, Vector at) {
+    if (body.cylinder.radius > 0) return potentials_of(body.cylinder, at);
+    const Vector g = potentials_of(body.solid, at), m = broadcast(body.m);
+    return {dot(m, g), cross(m, g)};
 }
 
 // Moment j of a body's lattice that the closed form replaces: only the part by the remanence if the body responds to

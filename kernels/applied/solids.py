@@ -3,11 +3,12 @@
 Bodies of one shape share its tables:
 
     shape: First row and number of edges and of faces, first entry of ``begin``, first corner, first and number of
-        points on edges and on faces, first entry and number of the moments, first number in ``cylinder`` or -1, shape
-        [shapes, 13].
+        points on edges and on faces, first entry and number of the moments, first number in ``cylinder`` or -1, first
+        and number of points on the rims and on the ends of the cylinder, shape [shapes, 17].
     edge, face, corner, begin: As in ``polyhedron.h``; flat.
-    edge_point, face_point: Quadrature points on edges and faces (``warpmag.shapes.polyhedra``), in chunks of
-        ``native.CHUNK`` side by side. Chunks are filled up with points of weight 0; flat.
+    edge_point, face_point: Quadrature points on edges and faces, and on rims and ends of cylinders
+        (``warpmag.shapes.polyhedra``), in chunks of ``native.CHUNK`` side by side. Chunks are filled up with points of
+        weight 0; flat.
     moment: Positions [m] and volumes [m³] of the moments that replace the closed form at a distance, in the frame of
         the body, in the same chunks; flat.
 
@@ -101,17 +102,24 @@ def _shape_tables(solids, fine: bool):
         replacing = np.c_[moments.positions, moments.volumes]
         begin = np.append(0, np.cumsum([len(face) for face in shape.faces]))
         on_edges, on_faces = _in_chunks(shape.edge_points()), _in_chunks(shape.face_points(fine=fine))
+        on_rims, on_ends = map(_in_chunks, shape.end_points(fine=fine))
         in_body = _in_chunks(replacing)
-        points = CHUNK * len(on_edges), CHUNK * len(on_faces), CHUNK * len(in_body)
+        edge_points, face_points, rim_points, end_points, moment_points = (
+            CHUNK * len(chunks) for chunks in (on_edges, on_faces, on_rims, on_ends, in_body)
+        )
         exact, start = shape.cylinder, counts.tolist()
         place = [] if exact is None else [*exact.center, *exact.axis, exact.radius, exact.half_height]
         rows.append([
-            start[0], len(edges), start[1], len(faces), start[2], start[3], start[4], points[0], start[5], points[1],
+            start[0], len(edges), start[1], len(faces), start[2], start[3],
+            start[4], edge_points, start[5], face_points,
             start[6], len(replacing), start[7] if len(place) else -1,
+            start[4] + edge_points, rim_points, start[5] + face_points, end_points,
         ])  # fmt: skip
         corners = shape.corners[np.concatenate([np.asarray(face) for face in shape.faces])]
-        values = edges, faces, corners, begin, on_edges, on_faces, in_body, place
+        edge_tables, face_tables = np.concatenate([on_edges, on_rims]), np.concatenate([on_faces, on_ends])
+        values = edges, faces, corners, begin, edge_tables, face_tables, in_body, place
         for name, part in zip(parts, values, strict=True):
             parts[name].append(np.asarray(part).reshape(-1))
+        points = edge_points + rim_points, face_points + end_points, moment_points
         counts += [len(edges), len(faces), len(begin), len(corners), *points, len(place)]
     return np.array(rows, np.int32), {name: np.concatenate(part) for name, part in parts.items()}

@@ -114,12 +114,13 @@ CUDA_CALLABLE inline Vector where(Mask active, Vector v) {
     return {active ? v.x : zero, active ? v.y : zero, active ? v.z : zero};
 }
 
-// Relative pose of a pair in numbers, and where it differs from the stored one. Pairs that are not near have one pose.
+// Relative pose of a pair in numbers, and where it differs from the stored one: everywhere in ``new_rows``. Pairs that
+// are not near have one pose.
 struct PoseRows {
     Number now[POSE_ROWS];
     Mask moved;
 
-    CUDA_CALLABLE PoseRows(const Real* rows, const RelativePose& pose, Number size, Mask near)
+    CUDA_CALLABLE PoseRows(const Real* rows, const RelativePose& pose, Number size, Mask near, bool new_rows)
         : now{pose.r.x, pose.r.y, pose.r.z, pose.q[0], pose.q[1], pose.q[2], pose.q[3]} {
         const Number zero = size * Real(0);
         Number change = zero;
@@ -129,7 +130,7 @@ struct PoseRows {
                          scaled = k < 3 ? difference / size : difference;
             change = larger(change, larger(scaled, -scaled));
         }
-        moved = change > POSE_TOLERANCE;
+        moved = new_rows ? mask_of(size == size) : mask_of(change > POSE_TOLERANCE);
     }
     // True if none of the stored pairs was near: their matrices are 0.
     static CUDA_CALLABLE bool all_far(const Real* rows) { return !any(numbers(rows + 3 * CHUNK) != FAR); }
@@ -147,8 +148,9 @@ CUDA_CALLABLE inline void tabulate_slot(const Rows<Pairs>& rows, int slot, Point
     const Cells found = rows.other_slots(slot);
     const Mask chosen = mask_of(indices(found.at) >= NONE_OWNS), active = near & chosen;
     Real* const stored = slot_at(a.pose.data, rows.capacity, POSE_ROWS, slot, rows.row);
-    if (!any(chosen) || (!any(active) && PoseRows::all_far(stored))) return;
-    const PoseRows change(stored, pose, box.size, active);
+    const bool new_rows = a.searching.data[0] != 0;
+    if (!any(chosen) || (!new_rows && !any(active) && PoseRows::all_far(stored))) return;
+    const PoseRows change(stored, pose, box.size, active, new_rows);
     if (!any(change.moved)) return;
     const BoxPair pair = rows.pair(box, slot, other, other_box, pose, active);
     const Number factor = pair.window.value * pair.unit * pair.unit * pair.unit;
@@ -183,7 +185,8 @@ template <class Pairs> CUDA_CALLABLE inline void tabulate(const Pairs& a, int ro
     for_candidates(rows.slots, rows.slots_of(OWN_CLOSE_KINDS), [&](int slot, Points points) {
         const Cells other = rows.candidates(slot);
         const Mask near = rows.near(box, other);
-        if (!any(near) && PoseRows::all_far(slot_at(a.pose.data, rows.capacity, POSE_ROWS, slot, row))) return;
+        const Real* const stored = slot_at(a.pose.data, rows.capacity, POSE_ROWS, slot, row);
+        if (a.searching.data[0] == 0 && !any(near) && PoseRows::all_far(stored)) return;
         const Boxes other_box = rows.boxes(other);
         const RelativePose pose = relative_pose(box, other_box);
         if (any(near)) end = slot + 1;
@@ -217,8 +220,7 @@ template <class Pairs> CUDA_CALLABLE inline void add_field(const Pairs& a, int r
     const Rotation<Number> frame = rotation_of<Number>(rows.boxes(rows.own).q);
     const Number zero = frame.rows[0][0] * Real(0);
     const Real *const means = (const Real*)a.means.data, *const differences = (const Real*)a.differences.data;
-    const int may_be_close = a.close_capacity > 0 ? rows.slots_of(CLOSE_KINDS) : 0;
-    const int close = may_be_close < a.close_capacity ? may_be_close : a.close_capacity;
+    const int close = rows.detailed_slots();
     Vector h = {zero, zero, zero}, g = h;
     for (int slot = share(); slot < a.near_end.data[row]; slot += SHARES) {
         const Cells other = rows.candidates(slot);
@@ -352,7 +354,6 @@ template <class Pairs> CUDA_CALLABLE inline void arrange_rows(const Pairs& a, in
     if (i >= a.group.shape[0]) return;
     if (pass == SELECT) select(a, i);
     if (pass == ASSIGN) assign(a, i);
-    if (pass == LINK && i < a.cell.shape[0]) link(a, i);
 }
 
 template <class Pairs> CUDA_CALLABLE inline void make_cell_pair_pass(const Pairs& a, int pass, int i) {
@@ -363,6 +364,10 @@ template <class Pairs> CUDA_CALLABLE inline void make_cell_pair_pass(const Pairs
         else if (pass == ADD_FIELD) add_field(a, i);
         else if (pass == ADD_FORCE) add_force(a, i);
         else add_reaction(a, i);
+        return;
+    }
+    if (pass == LINK) {
+        if (a.searching.data[0] != 0) link(a, i);
         return;
     }
     for (int l = 0; l < WIDTH; ++l)

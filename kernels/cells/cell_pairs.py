@@ -136,7 +136,7 @@ def cell_pairs_type(dtype):
         overlap_factor: wp.array[dtype]  # demagnetizing factor of overlaps over the volume [1/m³], shape [c padded]
         matrix: wp.array[dtype]  # T_ij of means [1/m³], shape [c padded / CHUNK, capacity, 9, CHUNK], flat
         detail: wp.array[dtype]  # of, at and between differences [1/m³], [c padded / CHUNK, close_capacity, 27, CHUNK]
-        reaction: wp.array[dtype]  # force and torque/μ0 by the row of the other cell, shape [c padded, capacity, 8]
+        reaction: wp.array[dtype]  # force and torque/μ0 by the row of the other cell, shape [capacity, c padded, 8]
 
     return CellPairs
 

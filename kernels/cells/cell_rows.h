@@ -118,17 +118,13 @@ template <class Pairs> CUDA_CALLABLE inline void arrange(const Pairs& a) {
     a.rows.data[0] = rows;
 }
 
-// Force and torque of a slot by the row of the other cell.
+// Force and torque of a slot by the row of the other cell. Only the first slots of rows have other owners, so that
+// slots come first: the memory beyond these is never written.
 template <class Pairs> CUDA_CALLABLE inline Real* reaction_at(const Pairs& a, int slot, int row) {
-    return a.reaction.data + REACTION_ROWS * ((size_t)row * a.candidate.shape[1] + slot);
+    return a.reaction.data + REACTION_ROWS * ((size_t)slot * a.cell.shape[0] + row);
 }
 
-CUDA_CALLABLE inline void clear(Real* entry, int rows) {
-    for (int k = 0; k < rows; ++k) entry[k * CHUNK] = 0;
-}
-
-// Gives a row to cell i, with poses of no pair, so that all entries are computed, and matrices of 0. Crowded candidates
-// take no part: the cell itself replaces them.
+// Gives a row to cell i. Crowded candidates take no part: the cell itself replaces them.
 template <class Pairs> CUDA_CALLABLE inline void assign(const Pairs& a, int i) {
     if (a.bin.data[i] < 0) return;
     const int count = a.candidate_count.data[i], capacity = a.candidate.shape[1];
@@ -146,25 +142,6 @@ template <class Pairs> CUDA_CALLABLE inline void assign(const Pairs& a, int i) {
         }
         if (k >= count) continue;
         *list_at(a.column.data, capacity, slot, row) = a.candidate_count.data[j] > capacity ? i : j;
-        slot_at(a.pose.data, capacity, POSE_ROWS, slot, row)[3 * CHUNK] = 9;
-        clear(slot_at(a.matrix.data, capacity, MATRIX_ROWS, slot, row), MATRIX_ROWS);
-        for (int k = 0; k < REACTION_ROWS; ++k) reaction_at(a, slot, row)[k] = 0;
-        if (slot < a.close_capacity)
-            clear(slot_at(a.detail.data, a.close_capacity, DETAIL_ROWS, slot, row), DETAIL_ROWS);
-    }
-}
-
-// Writes the slot of each owned pair of a row in the row of the other cell.
-template <class Pairs> CUDA_CALLABLE inline void link(const Pairs& a, int row) {
-    if (row >= *a.rows.data) return;
-    const int i = a.cell.data[row], capacity = a.candidate.shape[1], owned = end_of_kinds(a, i, OWNED_KINDS);
-    for (int slot = share(); slot < a.candidate_count.data[i]; slot += SHARES) {
-        const int j = *list_at(a.column.data, capacity, slot, row);
-        int found = slot < owned && !owns(i, j) ? OTHER_OWNS : NONE_OWNS;
-        if (slot < owned && owns(i, j))
-            for (int k = 0; k < a.candidate_count.data[j] && found < 0; ++k)
-                if (*list_at(a.column.data, capacity, k, a.row_of.data[j]) == i) found = k;
-        *list_at(a.other_slot.data, capacity, slot, row) = found;
     }
 }
 
@@ -198,6 +175,11 @@ template <class Pairs> struct Rows {
         int numbers[WIDTH];
         for (int l = 0; l < WIDTH; ++l) numbers[l] = counts[l] == 0 ? 0 : end_of_kinds(a, own.at[l], first_kinds);
         return largest_count(numbers);
+    }
+    // Number of slots with details.
+    CUDA_CALLABLE int detailed_slots() const {
+        const int close = a.close_capacity > 0 ? slots_of(CLOSE_KINDS) : 0;
+        return close < a.close_capacity ? close : a.close_capacity;
     }
     // Where differences act with the candidate of a slot: between close cells with room for the details of all their
     // close candidates.
@@ -253,4 +235,32 @@ template <class Pairs> struct Rows {
         return box_pair(box, other_box, pose, active, precedes(own, other), differ(slot, other));
     }
 };
+
+// Slot of an owned pair in the row of its other cell, or who owns it, for cell i of a row.
+template <class Pairs> CUDA_CALLABLE inline int slot_in_other_row(const Pairs& a, int i, int slot, int row) {
+    const int capacity = a.candidate.shape[1], j = *list_at(a.column.data, capacity, slot, row);
+    if (j == i) return NO_PAIR; // a crowded candidate
+    if (slot >= end_of_kinds(a, i, OWNED_KINDS)) return NONE_OWNS;
+    if (!owns(i, j)) return OTHER_OWNS;
+    for (int k = 0; k < a.candidate_count.data[j]; ++k)
+        if (*list_at(a.column.data, capacity, k, a.row_of.data[j]) == i) return k;
+    return NONE_OWNS;
+}
+
+// Links the owned pairs of a vector of rows with the rows of their other cells. Clears all details, because those of
+// pairs whose differences do not act are not computed.
+template <class Pairs> CUDA_CALLABLE inline void link(const Pairs& a, int row) {
+    if (row >= a.cell.shape[0]) return;
+    const Rows<Pairs> rows(a, row);
+    for (int slot = share(); slot < rows.slots; slot += SHARES)
+        for (int l = 0; l < WIDTH; ++l) {
+            if (slot >= rows.counts[l]) continue;
+            *list_at(a.other_slot.data, rows.capacity, slot, row + l) =
+                slot_in_other_row(a, rows.own.at[l], slot, row + l);
+        }
+    const int detailed = rows.detailed_slots();
+    for (int slot = share(); slot < detailed; slot += SHARES)
+        for (int k = 0; k < DETAIL_ROWS; ++k)
+            put(slot_at(a.detail.data, a.close_capacity, DETAIL_ROWS, slot, row) + k * CHUNK, Number(Real(0)));
+}
 }
