@@ -10,6 +10,8 @@
 #define blockIdx (cuda_on_cpu::Place{cuda_on_cpu::block})
 #define blockDim (cuda_on_cpu::Place{WP_TILE_BLOCK_DIM})
 
+using wp::__int_as_float; // CUDA has it in the global namespace
+
 namespace cuda_on_cpu {
 constexpr int WARPS = (WP_TILE_BLOCK_DIM + 31) / 32, MOST_COPIES = 64;
 struct Place {

@@ -38,6 +38,8 @@ _PER_ROW, _MOST_ROWS = {OF_TARGETS: 256, OF_BALLS: 8, OF_CELLS: 8}, 64
 _GROUP = 32  # threads of a GPU that share a source, or a row of its reaction
 _CELL_GROUP, _CELL_BLOCK = 4, 64
 """Threads of a GPU that share a cell, and threads of a block. The registers hold fewer blocks if blocks are larger."""
+_CELL_BLOCKS = {wp.float32: 8, wp.float64: 4}
+"""Such blocks per multiprocessor; limits the registers that compilers use."""
 
 
 @cache
@@ -51,7 +53,9 @@ def _kernel(dtype, only_pass: int, group: int, coils: bool, solids: bool, cells:
     constants |= dict(zip(("STEEP_REACH_LOW", "STEEP_REACH_HIGH"), near_cells.STEEP_REACH, strict=True))
     constants |= {kind.name: kind.value for kind in SourceKind}
     constants |= dict(zip(("BALLS", "MAGNET_REACH_LOW", "MAGNET_REACH_HIGH", "RESPONSE_ROWS"), balls, strict=True))
-    return native_kernel(call, "applied/passes.h", arguments, dtype=dtype, **constants)
+    of_cells = only_pass in (AT_CELLS, ON_CELLS)
+    launch = {"launch_bounds": (_CELL_BLOCK, _CELL_BLOCKS[dtype])} if of_cells else None
+    return native_kernel(call, "applied/passes.h", arguments, dtype=dtype, launch=launch, **constants)
 
 
 class AppliedField:
