@@ -280,7 +280,7 @@ class AppliedForces(AppliedField):
         solids, ranges = self.sources.solids_of_copy, sources.bodies_of(self._worlds)
         near_cells.lay_out(cells, bodies, rotations, solids, ranges, sources.dtype, self.device, copies)
         cells.movable, cells.forces, cells.torques = self.movable, forces, torques
-        for name in ("near", "near_x", "near_y", "near_z"):
+        for name in ("body_field", "body_field_x", "body_field_y", "body_field_z"):
             setattr(self.arrays.targets, name, wp.zeros_like(self.field))
         self.cell_count = cells.cell.shape[0]
         first_copy = cells.cell[: self.cell_count // copies].numpy()[:, 0]

@@ -165,20 +165,19 @@ template <class Vectors> CUDA_CALLABLE inline void add_real3(const Vectors& to, 
     put_real3(to, i, real3((const Real*)to.data + 3 * (size_t)i) + v);
 }
 CUDA_CALLABLE inline Real3 first_lane(Vector v) { return {lane_of(v.x, 0), lane_of(v.y, 0), lane_of(v.z, 0)}; }
-// Field of body b at the center of a cell, in all lanes. The pass over targets has written the field of the only source
-// within its reach.
+// Field of body b at the center of a cell, in all lanes. If the body is the only source, the pass over targets has
+// written this field within the body's reach. Rounding decides whether a target at the end of the reach is within it.
 template <class Arrays>
 CUDA_CALLABLE inline TargetField center_field(const Arrays& arrays, const Cell& cell, int b,
                                               const PermanentBody& body) {
     const Vector at = body.frame.point_to_body(broadcast(cell.center));
     const Real distance2 = lane_of(box_distance2(body, at), 0), reach2 = body.far_reach * body.far_reach;
-    if (arrays.only.data[arrays.coils.kind.shape[0] + b]
-        && distance2 < Real(0.999) * reach2) { // well within, if rounded
+    if (arrays.only.data[arrays.coils.kind.shape[0] + b] && distance2 < Real(0.999) * reach2) {
         auto read = [&](const auto& array) {
             return broadcast(real3((const Real*)array.data + 3 * (size_t)cell.moment));
         };
-        return {read(arrays.targets.near), read(arrays.targets.near_x), read(arrays.targets.near_y),
-                read(arrays.targets.near_z)};
+        return {read(arrays.targets.body_field), read(arrays.targets.body_field_x), read(arrays.targets.body_field_y),
+                read(arrays.targets.body_field_z)};
     }
     const Number zero = Number(Real(0)), radius = zero + cell.radius;
     return group_sums(

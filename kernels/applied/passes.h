@@ -80,7 +80,7 @@ template <bool POINTS, class Arrays> CUDA_CALLABLE inline void field_at_targets(
     const int offset = row % CHUNK, lane_count = chunk[1] - offset, i = chunk[0] + offset;
     if (lane_count <= 0) return;
     const Targets at = targets_at(arrays, i, lane_count);
-    TargetField acting = zero_target_field(), sum = acting;
+    TargetField acting = zero_target_field(), of_bodies = acting;
     Vector h = acting.h, inside = h, rate = h;
     if constexpr (COILS) {
         const auto& list = arrays.targets.lists.data[row / CHUNK];
@@ -97,7 +97,7 @@ template <bool POINTS, class Arrays> CUDA_CALLABLE inline void field_at_targets(
             const CurlFreeField whole = near_field(arrays, body, at.x, at.radius, near, share(), SHARES);
             const TargetField field =
                 target_field(whole - INVERSE_4PI * lattice_field(arrays, body, at.x, at.radius, near, share(), SHARES));
-            if constexpr (CELLS && !POINTS) add_where(near, sum, target_field(whole));
+            if constexpr (CELLS && !POINTS) add_where(near, of_bodies, target_field(whole));
             add_where(near, h, field.h);
             add_where(near & (at.label != body.label), acting, field);
             if constexpr (RATES)
@@ -108,7 +108,7 @@ template <bool POINTS, class Arrays> CUDA_CALLABLE inline void field_at_targets(
         }
     h = group_sums(h);
     acting = group_sums(acting);
-    if constexpr (CELLS && !POINTS) sum = group_sums(sum);
+    if constexpr (CELLS && !POINTS) of_bodies = group_sums(of_bodies);
     if constexpr (POINTS) inside = group_sums(inside);
     if constexpr (RATES) rate = group_sums(rate);
     if (share() != 0) return;
@@ -120,8 +120,8 @@ template <bool POINTS, class Arrays> CUDA_CALLABLE inline void field_at_targets(
     put(arrays.targets.along_x, acting.x), put(arrays.targets.along_y, acting.y);
     put(arrays.targets.along_z, acting.z);
     if constexpr (CELLS && !POINTS) {
-        put(arrays.targets.near, sum.h), put(arrays.targets.near_x, sum.x);
-        put(arrays.targets.near_y, sum.y), put(arrays.targets.near_z, sum.z);
+        put(arrays.targets.body_field, of_bodies.h), put(arrays.targets.body_field_x, of_bodies.x);
+        put(arrays.targets.body_field_y, of_bodies.y), put(arrays.targets.body_field_z, of_bodies.z);
     }
     if constexpr (POINTS) put(arrays.targets.inside, inside);
     if constexpr (RATES) put(arrays.targets.rate, rate);

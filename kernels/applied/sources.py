@@ -126,10 +126,10 @@ def target_arrays_type(dtype):
         along_x: wp.array[vec3]  # derivatives of the field of other bodies' sources [A/m²]
         along_y: wp.array[vec3]
         along_z: wp.array[vec3]
-        near: wp.array[vec3]  # with cells: field of permanent bodies within their reach [A/m], and its derivatives
-        near_x: wp.array[vec3]
-        near_y: wp.array[vec3]
-        near_z: wp.array[vec3]
+        body_field: wp.array[vec3]  # with cells: field of permanent bodies, where it is corrected [A/m]
+        body_field_x: wp.array[vec3]  # its derivatives [A/m²]
+        body_field_y: wp.array[vec3]
+        body_field_z: wp.array[vec3]
         rate: wp.array[vec3]  # rate of the field of other bodies' sources [A/(m·s)]
         inside: wp.array[vec3]  # at points: magnetization less that of the lattices' balls [A/m]
 

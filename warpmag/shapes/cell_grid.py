@@ -184,8 +184,8 @@ def cells_over(parts: Sequence[Solid], earlier: Sequence[Solid], spacing: float,
     cells_before = np.ceil((face - lower) / sides - 1e-6)
     counts = (cells_before + np.ceil((upper - face) / sides - 1e-6)).astype(int)
     splits = np.maximum(np.ceil(_FINE_POINTS * sides / thin - 1e-6).astype(int), 1)
-    few = 2 if len(parts) == 1 else 4  # with 2 in a shared grid a hammer at an angle has an eigenvalue of -0.0005
-    splits = np.where(splits > few, -(-splits // 8) * 8, 4)  # demagnetizing tensors use 8 or 4 subcells
+    coarsest = 2 if len(parts) == 1 else 4  # 8 subcells in place of 3 or 4 give a hammer an eigenvalue of -0.0005
+    splits = np.where(splits > coarsest, -(-splits // 8) * 8, 4)  # demagnetizing tensors use 8 or 4 subcells
     splits = splits if len(parts) == 1 else np.minimum(splits, _MOST_SPLITS)
     lower = face - cells_before * sides
     return CellGrid(solids, len(earlier), lower, sides, counts, splits, largest.position, largest.rotation)
