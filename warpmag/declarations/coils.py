@@ -142,7 +142,7 @@ class SourceRecord:
 
 @dataclass(frozen=True)
 class Coil:
-    """A coil in its own frame; each field is a row of the table of attributes.
+    """A coil in its own frame, with the attributes of the schema ``WarpmagCoilAPI``.
 
     The axis of loops and solenoids is z. A positive current causes a field along +z inside them. The current of a coil
     with a resistance follows from its voltage. The current of other coils is given.
@@ -283,9 +283,10 @@ class Coil:
 
 @dataclass(frozen=True, eq=False)
 class FieldMap:
-    """A field on a regular grid, in its own frame, and zero outside; each field is a row of the table of attributes.
+    """A field map in its own frame, with the attributes of the schema ``WarpmagFieldMapAPI``.
 
-    ``values`` has the shape [nx, ny, nz, 3], with at least two nodes along each axis.
+    The field is zero outside the grid. ``values`` has the shape [nx, ny, nz, 3], with at least two nodes along each
+    axis.
     """
 
     origin: Annotated[Vector, Attribute(

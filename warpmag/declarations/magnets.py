@@ -106,7 +106,7 @@ def check_rtol(name: str, value: Any, dtype: str = "float32") -> None:
 
 @dataclass(frozen=True)
 class Magnet:
-    """The magnetic material of one rigid body or collider; each field is a row of the table of attributes.
+    """The magnetic material of one rigid body or collider, with the attributes of the schema ``WarpmagMagnetAPI``.
 
     A measured ``curve`` sets ``saturation`` to its limit and ``susceptibility`` to its largest slope.
     ``magnetization`` is in the frame of the body or collider.
@@ -194,7 +194,7 @@ class Magnet:
 
 @dataclass(frozen=True)
 class MagneticSettings:
-    """Settings of a scene's magnetic solve; each field is a row of the table of attributes."""
+    """Settings of a scene's magnetic solve, with the attributes of the schema ``WarpmagSceneAPI``."""
 
     external_field: Annotated[tuple[float, float, float], Attribute(
         "externalField", "vector3f", "External Field", "Uniform applied field H0 in the world frame.",

@@ -29,8 +29,8 @@ class Material:
         name: Name of the material.
         kind: ``inducible`` or ``permanent``.
         polarization: Saturation polarization μ0·Ms of an inducible, remanence Br of a permanent material [T].
-        permeability: Initial relative permeability of an inducible material [dimensionless], the largest permeability
-            of a measured curve.
+        permeability: Initial relative permeability of an inducible material [dimensionless]. For a measured curve, the
+            largest permeability of the curve.
         density: Mass density [kg/m³].
         source: Source of the numbers.
         curve: Measured magnetization curve of an inducible material, or None.

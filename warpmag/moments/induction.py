@@ -49,11 +49,11 @@ class InductionResult:
 
     Attributes:
         magnetizations: M [A/m], shape [n, 3].
-        h_field: Field H at the balls [A/m], without the ball's own, shape [n, 3].
+        h_field: Field H at each ball [A/m], without the field of the ball itself, shape [n, 3].
         error: Estimated relative error of the magnetizations, ‖M − M*‖/‖M*‖ over all balls, where M* is the exact
-            solution. ``theta`` multiplies the last residual by its estimated amplification (see
-            ``warpmag.kernels.induction.theta_flow``). For other dynamics it is the residual ‖M − f(H)‖/‖f(H)‖, the
-            computable form of Eq. 12.
+            solution. With ``dynamics="theta"`` it is the last residual times its estimated amplification (see
+            ``warpmag.kernels.induction.theta_flow``). With other dynamics it is the residual ‖M − f(H)‖/‖f(H)‖, the
+            computable form of Eq. 12 of Kim and Han 2022.
         evaluations: Number of field evaluations.
         converged: True if ``error`` is at most ``rtol``.
         field_error: Relative error ‖H − H_exact‖/‖H_exact‖ of the fast multipole method's field at 256 random balls,

@@ -29,7 +29,7 @@ class FieldProbe:
     Args:
         system: The moments.
         count: Number of points p.
-        worlds: World of each point, shape [p]; None means the first for all. Points of one world should be adjacent,
+        worlds: World of each point, shape [p]; None means the first world. Points of one world should be adjacent,
             because each run of adjacent points is summed separately.
         gradients: True to compute gradients, which takes three more sums over pairs.
 
@@ -39,11 +39,12 @@ class FieldProbe:
 
     Attributes:
         points: The points [m], shape [p]; written by the caller before :meth:`measure`.
-        h: Field H [A/m], shape [p]: the sum of the external field, the field of sources (``kernels.applied``), and the
-            field of all moments (Kim and Han 2022, Eq. 1). A moment is a uniformly magnetized ball inside its radius.
+        h: Field H [A/m], shape [p]: the sum of the external field, the fields of coils, field maps and nearby
+            permanent bodies (``kernels.applied``), and the field of all moments (Kim and Han 2022, Eq. 1). A moment is
+            a uniformly magnetized ball inside its radius.
         b: Flux density B = μ0 (H + M) [T], shape [p].
-        gradient: Gradient of the field [A/m²], matrices with rows ∇H_x, ∇H_y, ∇H_z, shape [p]. It includes sources, but
-            not the external field, which is uniform. None without ``gradients``.
+        gradient: Gradient of :attr:`h` [A/m²], matrices with rows ∇H_x, ∇H_y, ∇H_z, shape [p]. The uniform external
+            field has no part in it. None without ``gradients``.
     """
 
     def __init__(

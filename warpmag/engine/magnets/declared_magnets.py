@@ -49,7 +49,7 @@ def add_inducible(
         shape: Index, label or pattern of shapes, in place of ``body``: single shapes, for example static ones.
         material: Name of an inducible material of :mod:`warpmag.declarations.materials`. It replaces ``saturation`` and
             ``susceptibility``, and ``curve`` if the material has a measured curve. A body whose mass follows from
-            Newton's default density gets the material's.
+            Newton's default density gets the density of the material.
         saturation: Saturation magnetization Ms [A/m], 1.7e6 by default.
         susceptibility: Susceptibility χ [dimensionless], infinite by default.
         curve: Formula of the magnetization curve, ``tanh`` (default), ``langevin``, ``clamped``, ``frohlich`` or
@@ -122,7 +122,7 @@ def add_permanent(
         magnetization: Magnetization M [A/m] in the frame of the body, or of a static shape.
         remanence: Remanence Br [T] of a data sheet, M = Br/μ0.
         material: Name of a permanent material of :mod:`warpmag.declarations.materials`, such as ``"N42"``. A body whose
-            mass follows from Newton's default density gets the material's.
+            mass follows from Newton's default density gets the density of the material.
         direction: Direction of the magnetization for ``remanence`` and ``material``, of any length, in the frame of the
             body, or of a static shape.
         recoil_permeability: μ of M = M_r + (μ − 1) H [dimensionless], with the internal field H and ``magnetization``

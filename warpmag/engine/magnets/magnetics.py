@@ -188,7 +188,7 @@ class Magnetics:
 
     @property
     def external_field(self) -> wp.array:
-        """Uniform applied field H0 [A/m] at each moment on the device, world frame, shape [moments]."""
+        """Uniform applied field H0 [A/m], repeated for each moment, on the device, world frame, shape [moments]."""
         return self.system.external_field
 
     @property
@@ -221,7 +221,7 @@ class Magnetics:
         return self.system.eddy is not None
 
     def magnetic_shapes(self) -> MagneticShapes:
-        """Return the magnets and coils; their distances limit for how long substeps may share forces."""
+        """Return the shapes of magnets and coils, whose gaps limit how many substeps share forces."""
         radii = self._model.shape_collision_radius.numpy()[self.shapes]
         coils = {k: radius for k, radius in zip(self._sources.shapes, self._sources.radii, strict=True) if radius > 0.0}
         shapes, spacing = [*self.shapes, *coils], self._sources.spacing
@@ -393,7 +393,7 @@ class Magnetics:
         return self.system.persistent_arrays() | {f"few.{name}": array for name, array in few.items()}
 
     def stepped_arrays(self) -> list[wp.array]:
-        """Return the currents and the start of the induction; restore copies and :meth:`restart` to repeat a step."""
+        """Return the arrays that a step changes. To repeat a step, restore copies and call ``discard_attempt``."""
         currents = [] if self.coils is None else self.coils.stepped_arrays()
         return currents + [array for system in self._systems for array in system.start_arrays()]
 
@@ -575,9 +575,13 @@ class Magnetics:
         warn_caller(text, ConvergenceWarning)
 
     def energy(self) -> np.ndarray:
-        """Return the present energy of the magnets of each world [J], shape [worlds]; 0 for a world without magnets.
+        """Return the energy of each world at the last solve [J], shape [worlds]; 0 for a world without magnets.
 
-        Its negative gradient with respect to positions is the Kelvin force, see :meth:`MomentSystem.energy`.
+        It is the energy of all fields and of the magnetization curves. Only differences between poses are meaningful.
+        Its negative gradient with respect to positions is the Kelvin force. Waits for the device.
+
+        Raises:
+            InputError: There is no solve yet, or the contact model is ``multipole``.
         """
         self._check_solved()
         self.check_model()

@@ -18,15 +18,15 @@ from warpmag.errors import InputError
 
 
 def register_custom_attributes(builder: newton.ModelBuilder) -> None:
-    """Declare the attributes of magnets and sources; call it before the functions that add them.
-
-    Newton's solvers have class methods of the same name. ``register_attributes`` is an earlier name of this function.
+    """Declare the attributes of magnets, coils and field maps; call it before the functions that add them.
 
     Newton's ``builder.add_usd(stage)`` then imports the magnets, coils and field maps of a stage, too. Magnets are
     colliders, or their rigid bodies, with ``WarpmagMagnetAPI``; unauthored attributes have their default values.
 
+    Newton's solvers have class methods of the same name. ``register_attributes`` is an earlier name of this function.
+
     Args:
-        builder: The builder; declaring twice does nothing.
+        builder: The builder. A second call for it does nothing.
 
     Example:
         >>> import newton

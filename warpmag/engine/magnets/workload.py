@@ -14,23 +14,38 @@ _MOST_LINES = 10
 
 @dataclass(frozen=True)
 class BodyLoad:
-    """Moments of one magnet and its estimated time. A magnet consists of all magnetic shapes of one body."""
+    """Moments of one magnet and its estimated time. A magnet consists of all magnetic shapes of one body.
 
-    label: str  # of its first shape
-    world: int  # Newton world, -1 for none
-    kind: str  # ``inducible`` or ``permanent``
+    Attributes:
+        label: Label of its first shape.
+        world: Newton world, -1 for none.
+        kind: ``inducible`` or ``permanent``.
+        moments: Number of moments.
+        near_cells: Number of cells so close to a permanent magnet that its field is averaged over them.
+        seconds: Estimated share of the time of a step [s].
+    """
+
+    label: str
+    world: int
+    kind: str
     moments: int
-    near_cells: int  # cells so close to a permanent magnet that its field is averaged over them
-    seconds: float  # estimated share of the time of a step [s]
+    near_cells: int
+    seconds: float
 
 
 @dataclass(frozen=True)
 class Workload:
-    """Time of each part of a step, and estimated time of each body; ``str`` returns both as a table."""
+    """Time of each part of a step, and estimated time of each body; ``str`` returns both as a table.
 
-    seconds: dict[str, float]  # time of each part [s]
-    bodies: tuple[BodyLoad, ...]  # the most expensive first
-    evaluations: np.ndarray  # field evaluations of the last solve, shape [worlds with magnets]
+    Attributes:
+        seconds: Time of each part [s], by name.
+        bodies: Moments and times of the magnets, the most expensive first.
+        evaluations: Field evaluations of the last solve, shape [worlds with magnets].
+    """
+
+    seconds: dict[str, float]
+    bodies: tuple[BodyLoad, ...]
+    evaluations: np.ndarray
 
     @property
     def world_seconds(self) -> dict[int, float]:

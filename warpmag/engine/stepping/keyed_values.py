@@ -77,7 +77,7 @@ class KeyedCurrents:
 
     Coils with a resistance have time-sampled voltages in place of currents.
 
-    ``Simulation`` applies all time samples of a stage itself. This class applies only those of coils: ``add_usd``
+    ``Simulation`` applies the time samples of a stage itself. This class applies only those of coils: ``add_usd``
     imports poses and magnetizations at the start of the stage, without their time samples. Replicated worlds share the
     time samples.
 

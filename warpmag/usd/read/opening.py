@@ -48,7 +48,7 @@ def open_stage(path: str | os.PathLike, time_code: float | None = None) -> Usd.S
 
     Returns:
         The stage in meters and kilograms, with prims for each instance of a body. Its layers are unchanged; all
-        additions are in its session.
+        additions are in its session layer.
 
     Raises:
         InputError: The file is missing, is not USD or does not compose, or ``time_code`` is not a finite number.
