@@ -2,7 +2,8 @@
 //
 // Boxes at an angle share at most as much as each shares with the bounding box of the other one in its own frame. They
 // are disjoint if their projections on an axis are: on one of the edges, or on a normal of an edge of each (separating
-// axes, Gottschalk, Lin and Manocha 1996). So a common part that is less on normals than on edges is a factor.
+// axes, Gottschalk, Lin and Manocha 1996). So if the common part of the projections is smaller on normals than on
+// edges, the ratio of the two is a factor of the share.
 #pragma once
 #include "cells/box_pair.h"
 

@@ -1,12 +1,12 @@
 // Tensor and forces of a pair of magnetized boxes, less those of balls of the same volumes, in the frame of box i.
 //
 // The tensor of close boxes is the field of the longer box, averaged over 2³ Gauss points of the shorter one, whose
-// points are closer together: with the points of a sheet of long cells on one of shorter, thicker cells the operator
-// of induction would have negative eigenvalues. Beside a flat box the field varies more over its faces, so 4 × 4 × 2
-// points replace them there. One of a pair may be a ball: a ball's field is a closed form, too, and the average over a
-// ball is the value at its center. Boxes farther apart differ from balls by their quadrupoles. A window function ends
-// this difference. Forces are the exact derivatives of the energy −μ0 m_i·T_ij·m_j, so that they conserve energy and
-// momentum. Lengths are in units of the mean of the boxes' sizes.
+// points are closer together. With the points of the longer box the operator of induction would have negative
+// eigenvalues, for a sheet of long cells that lies on a sheet of shorter, thicker cells. Beside a flat box the field
+// varies more over its faces, so 4 × 4 × 2 points replace them there. One of a pair may be a ball: a ball's field is a
+// closed form, too, and the average over a ball is the value at its center. Boxes farther apart differ from balls by
+// their quadrupoles. A window function ends this difference. Forces are the exact derivatives of the energy
+// −μ0 m_i·T_ij·m_j, so that they conserve energy and momentum. Lengths are in units of the mean of the boxes' sizes.
 //
 // From Python: WINDOW_BEGIN, WINDOW_END, CLOSE_BEGIN, CLOSE_END, FINE_BEGIN and FINE_END, distances of the windows.
 #pragma once

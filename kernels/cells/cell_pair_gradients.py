@@ -20,7 +20,7 @@ _OF_FIELD, _OF_WRENCH = range(2)
 _STEP = 3e-6
 """Largest motion of a pair in a difference, in mean sizes and radians: about the cube root of the precision."""
 _SHARED = "candidate", "candidate_count", "rows", "cell", "column", "kind_end", "close_capacity"
-"""Whole numbers and their arrays that are those of the pairs."""
+"""Integers and integer arrays that are shared with the pairs, not copied."""
 
 
 @wp.struct

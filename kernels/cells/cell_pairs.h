@@ -2,8 +2,8 @@
 //
 // The sums over pairs treat a cell as a ball. Here the cells are boxes, and T_ij is the difference (``box_pair.h``).
 // Balls near cells take part, too; their frame is the world.
-// Rows are in the frame of box i and columns in that of box j: a box's axes are the axes of its body's grid. They are
-// computed again when the relative pose of their bodies has changed.
+// The rows of T_ij are in the frame of box i and its columns in that of box j: a box's axes are the axes of its body's
+// grid. A tensor is computed again when the relative pose of the two bodies has changed.
 //
 // From Python: OVERLAP_DEMAGNETIZATION, the demagnetizing factor added to a cell inside another body, OVERLAP_BEGIN and
 // OVERLAP_END, the shares of its volume from which it gets some and all of it; OVERLAP_BODIES, the number of bodies
@@ -114,8 +114,8 @@ CUDA_CALLABLE inline Vector where(Mask active, Vector v) {
     return {active ? v.x : zero, active ? v.y : zero, active ? v.z : zero};
 }
 
-// Relative pose of a pair in numbers, and where it differs from the stored one: everywhere in ``new_rows``. Pairs that
-// are not near have one pose.
+// Relative poses of a vector of pairs as numbers, and a mask of the pairs that have moved since the stored pose. In
+// ``new_rows`` all have moved. All pairs that are not near have the same pose.
 struct PoseRows {
     Number now[POSE_ROWS];
     Mask moved;

@@ -3,8 +3,8 @@
 The sums over pairs treat a cell as a ball, which is wrong for neighbors: a flat cell's ball reaches through a sheet. So
 cells that are near each other act on each other as boxes, at the present poses of their bodies (``cell_pairs.h``). The
 candidates are found by the neighbor search of ``pairs.neighbors``. The tensor of a pair is kept while the relative pose
-of its bodies rests. The row of one cell of a close pair computes for both. Balls act on cells by the average of their
-field and its difference between the halves of a cell.
+of its bodies does not change. A close pair is computed once, for both cells (``cell_rows.h``). The field of a ball at a
+cell is an average over the cell, and a difference between its halves.
 
 The operator of induction is positive for disjoint bodies: it is the exact one, integrated by Gauss points. For bodies
 that intersect the points can make it negative. So a cell inside another body gets an additional demagnetizing factor.
@@ -26,26 +26,26 @@ from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
 WINDOW = 2.5, 3.5
-"""Distances at which boxes start to turn into balls and are balls, in mean sizes of two boxes. The size of a box is its
-longest side times the root of its ratio to the shortest side, less for small cells. Dipoles lack the quadrupole of flat
-cells, and need more distance. Without :data:`_OF_SHEETS` the force between two discs of 40:2 mm has an error of 5 %,
-and 3 % with 4.5 and 6. But then up to five times as many cells are in the lists."""
+"""Distances between which the law of boxes is blended into that of balls, in mean sizes of two boxes. The size of a box
+is its longest side times the root of its ratio to the shortest side, less for small cells. Dipoles lack the quadrupole
+of flat cells, and need more distance. Without :data:`_OF_SHEETS` the force between two discs of 40:2 mm has an error of
+5 %, and 3 % with 4.5 and 6. But then up to five times as many cells are in the lists."""
 _OF_SHEETS = 1.5
 """Factor of the sizes of linear cells in sheets of one or two layers. The fields of their cells almost cancel, but not
 where the formulas change with the distance. Without the factor the operator of three sheets of 30 × 30 × 1 mm that lie
 on each other would have an eigenvalue of -0.0014, and forces in stacks of discs would be 1 to 2 % larger. If the factor
 applied to :data:`CLOSE` only, the eigenvalue would be -0.0002, and to :data:`WINDOW` only, -0.0013."""
 _FLATTEST = 3.0
-"""Largest ratio of sides that increases a size, that of whole cells at automatic spacing. Flatter cells are parts that
-a surface cuts off, of little volume."""
+"""Largest ratio of sides that increases a size: the largest of whole cells at automatic spacing. Flatter boxes are
+cells of little volume that the surface cuts."""
 CLOSE = 1.75, 2.25
-"""Distances between which the average over close boxes turns into their quadrupoles, also in mean sizes. With distances
-in mean longest sides, the operator of a stack of five sheets would have an eigenvalue of -0.0025."""
+"""Distances between which the average over close boxes is blended into their quadrupoles, also in mean sizes. With
+distances in mean longest sides, the operator of a stack of five sheets would have an eigenvalue of -0.0025."""
 FINE = 1.2, 1.6
-"""Distances between which 4 × 4 × 2 points of a flat box turn into 2³, in mean longest sides. The demagnetizing factor
-between touching boxes twice as wide as high is 7 % too large with 2³ points. Cells beside a touching one are within 1.2
-sides. The force between two discs of 40:2 mm has an error of 3 %. With 0.9 and 1.2 it is 9 %, with 2.1 and 2.6 it is
-4 %. A pair with fine points takes four times as long as another close one."""
+"""Distances between which 4 × 4 × 2 points of a flat box are blended into 2³, in mean longest sides. The demagnetizing
+factor between touching boxes twice as wide as high is 7 % too large with 2³ points. Cells beside a touching one are
+within 1.2 sides. The force between two discs of 40:2 mm has an error of 3 %. With 0.9 and 1.2 it is 9 %, with 2.1 and
+2.6 it is 4 %. A pair with fine points takes four times as long as another close one."""
 FLAT = 0.57
 """Ratio of the shortest side to the next one below which whole cells of a body are flat."""
 OVERLAP_DEMAGNETIZATION = 0.45
@@ -63,8 +63,8 @@ _LONGEST_LIST = 2048
 _LONGEST_CLOSE = 192
 """Largest number of close candidates of a cell whose differences act on other bodies."""
 _BALL_REACH = 2.1
-"""Half side of the box that represents a ball in :data:`WINDOW`, in longest half sides of the cells of its world.
-Nearer than 2.7 to 3.5 sides the field of a ball differs between the halves of a cell."""
+"""Half side of the box that represents a ball in :data:`WINDOW` and :data:`CLOSE`, in longest half sides of the cells
+of its world. The average over cubic cells of equal size ends at distances of 2.7 to 3.5 sides."""
 _MOST_BALLS = 400
 """Largest number of balls near a cell: those at least as wide as a cell, packed densely on one side."""
 _SHORTEST_LIST = 64
@@ -130,12 +130,12 @@ def cell_pairs_type(dtype):
         cell: wp.array[int]  # cell of each row, shape [c padded]
         row_of: wp.array[int]  # row of each moment that has one, shape [n]
         column: wp.array[int]  # candidates of each row, shape [c padded / CHUNK, capacity, CHUNK], flat
-        other_slot: wp.array[int]  # slot of each owned pair in its other cell's row, or who owns it, like ``column``
+        other_slot: wp.array[int]  # slot of each owned pair in its other cell's row, or its owner, like ``column``
         near_end: wp.array[int]  # end of the slots in the window, of vectors of rows, shape [c padded]
         pose: wp.array[dtype]  # relative pose of each tensor, shape [c padded / CHUNK, capacity, 7, CHUNK], flat
         overlap_factor: wp.array[dtype]  # demagnetizing factor of overlaps over the volume [1/m³], shape [c padded]
         matrix: wp.array[dtype]  # T_ij of means [1/m³], shape [c padded / CHUNK, capacity, 9, CHUNK], flat
-        detail: wp.array[dtype]  # of, at and between differences [1/m³], [c padded / CHUNK, close_capacity, 27, CHUNK]
+        detail: wp.array[dtype]  # T_ij of differences [1/m³], shape [c padded / CHUNK, close_capacity, 27, CHUNK]
         reaction: wp.array[dtype]  # force and torque/μ0 by the row of the other cell, shape [capacity, c padded, 8]
 
     return CellPairs
@@ -191,7 +191,7 @@ def _balls_among_cells(balls, radii, worlds, group, half) -> np.ndarray:
 def _list_length(bodies, group, balls, reach: float) -> int:
     """Return the length of lists for candidates up to ``reach`` [m] of bodies that do not intersect.
 
-    At most all bodies of a world are around a cell, or a solid of those with the smallest cells. ``balls`` are the
+    The bodies of a world fill a sphere of the radius ``reach``, those with the smallest cells first. ``balls`` are the
     indices of balls. Bodies that intersect can have more candidates.
     """
     near = {id(coupling): _most_near(coupling.positions, reach) for _, coupling in bodies}

@@ -107,7 +107,7 @@ template <class Pairs> CUDA_CALLABLE inline void select(const Pairs& a, int i) {
     increment(a.bin_end.data + a.bin.data[i]);
 }
 
-// Makes the counts of the bins their first rows. Rows of a vector then have similar numbers of candidates.
+// Converts the numbers of rows of the bins to first rows. Rows of a vector then have similar numbers of candidates.
 template <class Pairs> CUDA_CALLABLE inline void arrange(const Pairs& a) {
     int rows = 0;
     for (int k = 0; k < BINS; ++k) {
@@ -124,7 +124,7 @@ template <class Pairs> CUDA_CALLABLE inline Real* reaction_at(const Pairs& a, in
     return a.reaction.data + REACTION_ROWS * ((size_t)slot * a.cell.shape[0] + row);
 }
 
-// Gives a row to cell i. Crowded candidates take no part: the cell itself replaces them.
+// Writes the row of cell i. Crowded candidates take no part: the cell itself replaces them.
 template <class Pairs> CUDA_CALLABLE inline void assign(const Pairs& a, int i) {
     if (a.bin.data[i] < 0) return;
     const int count = a.candidate_count.data[i], capacity = a.candidate.shape[1];

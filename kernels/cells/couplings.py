@@ -18,8 +18,8 @@ from warpmag.kernels.shared.team import launch_passes, threads_for
 DIFFERENCES, UNIFORM_FIELD, TRANSPOSE, ADD = range(4)  # the passes, in order; as in ``couplings.h``
 _CELLS_PER_THREAD = 500  # cells per thread of a CPU, at least
 _FEW_THREADS, _MANY_CELLS = 2, 50_000
-"""Threads of a GPU that share a cell where cells alone fill the GPU, and the number of such cells. Few threads a cell
-read neighboring entries of the table together."""
+"""Threads of a GPU per cell if the cells alone fill the GPU, and the smallest number of such cells. With few threads
+per cell, reads of neighboring entries of the table coalesce."""
 
 
 @cache
@@ -133,9 +133,9 @@ class CellCouplings:
         self._launches = [self._record(c, *ends) for ends in ranges]
 
     def sum_active(self, list_active):
-        """Sum only chunks of worlds that do not rest from now on, on a GPU.
+        """Leave out the chunks of resting worlds in all later sums, on a GPU.
 
-        ``list_active`` returns for chunks, a Warp array, their list on the device: a number, then indices.
+        ``list_active`` takes the array ``chunk`` and returns a Warp array: the number of active chunks, then indices.
         """
         self._couplings.active = list_active(self._couplings.chunk)
         self._record_all()

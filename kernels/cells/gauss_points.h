@@ -8,8 +8,8 @@ constexpr Real GAUSS_PLACE = Real(0.5773502691896258); // of two points in a box
 
 CUDA_CALLABLE inline Number shortest(Vector half) { return smaller(half.x, smaller(half.y, half.z)); }
 
-// Range of the 2³ Gauss points of a box, shares of whose sums are evaluated. Shares that belong to no point are part of
-// the first one's.
+// Range of the 2³ Gauss points of a box that a thread sums over. Terms that belong to no point are added with the first
+// point.
 struct Points {
     int first, count;
 };

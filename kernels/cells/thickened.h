@@ -1,4 +1,4 @@
-// Boxes that are thickened where others intersect them, as sources of fields that Gauss points average.
+// Thickening of source boxes that intersect their targets, for averages over the Gauss points of the targets.
 #pragma once
 #include "cells/gauss_points.h"
 #include "cells/rotation.h"
@@ -20,8 +20,8 @@ CUDA_CALLABLE inline Number least_common(Vector own, Vector extent, Vector at) {
 
 // Half sides of a source that a target intersects, for its field: along each axis at least the distance of the target's
 // Gauss points from its center, for the same moment. A thin sheet in a cell would contain none of the points or half of
-// them, and then the operator of the cells is not positive. Arguments as in ``SourceAndTarget``. A GPU calls the
-// function: in line it took registers from all pairs, which then took 1.6 times as long.
+// them, and then the operator of the cells is not positive. Arguments as in ``SourceAndTarget``. The function
+// is not inlined: on a GPU its registers would slow all pairs, which then took 1.6 times as long.
 __attribute__((noinline)) CUDA_CALLABLE inline Vector thickened(Vector half, Vector target, Vector center,
                                                                 const Rotation<Number>& rotation) {
     auto magnitude = [](Number x) { return larger(x, -x); };

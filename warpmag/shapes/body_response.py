@@ -1,16 +1,15 @@
-"""Response of a body to a residual of its magnetization, as a whole: the inverse of its own operator.
+"""Update of all cells of a body together from their residuals, by the inverse of the operator of the body.
 
-An induction solve compares the reduced field g of each moment with its dual variable s (``kernels/induction``). A lone
-body of χ = ∞, far from saturation, is solved by s + Q (g − s) with Q = (1 − 3 T V)⁻¹. Here 3 is the initial slope k of
-a ball, T are the tensors between the body's cells, and V their volumes. Among other bodies, Q removes the slow modes of
-the body itself from the iteration.
+An induction solve compares the reduced field g = k H/M_s of each moment with its dual variable s
+(``kernels/induction``). A lone body of χ = ∞, far from saturation, is solved by s + Q (g − s) with Q = (1 − 3 T V)⁻¹.
+Here 3 is the initial slope k of a ball, T are the tensors between the body's cells, and V their volumes. Among other
+bodies, Q removes the slow modes of the body itself from the iteration.
 
-**Mirrors.** Let the cells of a body be symmetric with respect to planes through its center, across m of the axes. Then
-the operator acts separately on magnetizations of each of 2ᵐ parities p. A parity is one sign for each mirror: the
-mirror leaves the magnetization unchanged, or reverses it. A mirror across an axis reverses the component along this
-axis. The cells that mirrors map to each other are an orbit. The values at one cell of each orbit determine a
-magnetization of parity p. So 2ᵐ matrices between orbits replace the matrix between cells. For a plate they have an
-eighth of its elements.
+**Mirrors.** Let the cells of a body be symmetric with respect to m planes through its center, each normal to an axis.
+Then the operator acts separately on magnetizations of each of 2ᵐ parities p. A parity is one sign for each mirror: the
+mirror leaves the magnetization unchanged, or reverses it. A mirror reverses the component along its normal. The cells
+that mirrors map to each other are an orbit. The values at one cell of each orbit determine a magnetization of parity p.
+So 2ᵐ matrices between orbits replace the matrix between cells. For a plate they have an eighth of its elements.
 """
 
 from typing import NamedTuple
@@ -28,29 +27,30 @@ _SLOPE = 3.0
 """Initial slope k = 3χ/(3 + χ) of a ball of χ = ∞."""
 _SHIFT = 0.01
 """Number added to all eigenvalues before the inversion, because those of sheets and of loops of magnetization are below
-0.001. With 0.03 a lone plate of χ = ∞ takes 1.5 times as many evaluations, with 0.001 one of χ = 300 1.3 times."""
+0.001. With 0.03 a lone plate of χ = ∞ takes 1.5 times as many evaluations. With 0.001 a plate of χ = 300 takes 1.3
+times as many."""
 _POWERS = 30
-"""Products with a vector that give the largest eigenvalue, to some percent."""
+"""Number of steps of the power method; the largest eigenvalue then has an error of some percent."""
 _SYMMETRIC = 1e-3
-"""Largest relative change by a mirror: of the product of the operator with a random vector, and of radii; and of
-positions, in radii. Solves converge to the same solution with any response."""
+"""Tolerance of a symmetry. It bounds three changes by a mirror: of positions, in radii, and the relative changes of
+radii and of the operator times a random vector. Solves converge to the same solution with any response."""
 
 
 class BodyResponse(NamedTuple):
     """Q − 1 of a body, by parity."""
 
     cells: int  # number of cells
-    mirrors: int  # bits of the axes x, y, z across which the body is symmetric
-    images: np.ndarray  # image of the first cell of each orbit by the mirrors of the bits of g, shape [8, orbits]
-    tables: np.ndarray  # Q − 1 between orbits, shape [parities, orbits, 3, orbits, 3]; upper halves of float32
+    mirrors: int  # bits 0, 1, 2: the body has a mirror plane normal to x, y, z
+    images: np.ndarray  # row k: images of the first cells of orbits by the mirrors in the bits of k, shape [8, orbits]
+    tables: np.ndarray  # Q − 1 between orbits, shape [parities, orbits, 3, orbits, 3]; upper 16 bits of float32
     largest: float  # largest eigenvalue
 
 
 def residual_response(coupling: Coupling) -> BodyResponse:
     """Return Q − 1 between the cells of a body, in its frame.
 
-    The elements are the upper halves of float32, rounded to nearest, type uint16. Parities p ascend, and have no bits
-    but those of ``mirrors``; so do the rows of ``images`` that are used.
+    The elements are the upper 16 bits of float32, rounded to nearest, type uint16. The parities are the subsets of the
+    bits of ``mirrors``, ascending. Only these rows of ``images`` are used.
     """
     volumes = 4.0 / 3.0 * np.pi * coupling.radii**3
     root, count = np.sqrt(volumes), len(volumes)
@@ -72,7 +72,7 @@ def residual_response(coupling: Coupling) -> BodyResponse:
 
 
 def _within(mirrors: int) -> list[int]:
-    """Return the numbers of three bits that have no other bits than ``mirrors``, ascending."""
+    """Return the subsets of the bits of ``mirrors``, ascending."""
     return [number for number in range(8) if number & ~mirrors == 0]
 
 
@@ -101,14 +101,14 @@ def _images(operator: np.ndarray, coupling: Coupling) -> tuple[int, np.ndarray]:
 
 
 def _signs(mirror: int, mirrors: int, parity: int) -> np.ndarray:
-    """Return the signs of a parity's components x, y and z at the image of a cell by the mirrors of some bits."""
+    """Return the signs of the components x, y and z of a parity at the image of a cell by the mirrors in ``mirror``."""
     return np.array([(-1.0) ** (mirror & (parity ^ (1 << axis & mirrors))).bit_count() for axis in range(3)])
 
 
 def _folded(operator: np.ndarray, images: np.ndarray, mirrors: int, parity: int) -> np.ndarray:
     """Return the operator between magnetizations of a parity in the first cells of orbits, shape [3 orbits, 3 orbits].
 
-    Components that a parity does not have in a cell on a mirror are unchanged.
+    In a cell on a mirror plane some components of a parity are 0. Their rows and columns are those of the unit matrix.
     """
     used = _within(mirrors)
     rows, total = operator[images[0]], np.zeros((len(images[0]), 3, len(images[0]), 3))
@@ -117,7 +117,7 @@ def _folded(operator: np.ndarray, images: np.ndarray, mirrors: int, parity: int)
         signs = _signs(mirror, mirrors, parity)
         total += rows[:, :, images[mirror]] * signs
         absent |= (images[mirror] == images[0])[:, None] & (signs < 0.0)
-    distinct = np.array([len(set(orbit)) for orbit in images[used].T])  # others occur several times
+    distinct = np.array([len(set(orbit)) for orbit in images[used].T])  # cells on a mirror plane are their own images
     folded = (total * (distinct / len(used))[:, None]).reshape(absent.size, absent.size)
     absent = absent.ravel()
     folded[absent], folded[:, absent] = 0.0, 0.0

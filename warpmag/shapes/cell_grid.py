@@ -17,10 +17,10 @@ _FLATTEST = 4.0
 _SMALL = 0.1
 """Shapes below this share of the largest shape's volume do not make the cells of a shared grid narrower."""
 _WIDEST = 1.25
-"""Largest change of a cell's side by which faces of a mesh come to lie between cells."""
+"""Largest factor by which a side of a cell changes, to place faces of a mesh between cells."""
 _DEVIATION = 0.2
-"""Cost of a change of the sides, over its squared logarithm: a change by a fifth costs as much as a face of 3 % of the
-cross-section in the middle of a cell."""
+"""Cost of a change of a side, over its squared logarithm. A change by a fifth costs as much as a face in the middle of
+a cell, of 3 % of the cross-section."""
 _MOST_POINTS = 1 << 23
 """Largest number of test points of a shape that are not evaluated in chunks: 200 MB, and a few seconds."""
 _CHUNK = 1 << 18
@@ -40,7 +40,7 @@ class Filled:
 
 @dataclass(frozen=True)
 class CellGrid:
-    """Equal cells over shapes, in the frame of the largest. Along each axis they fit the thinnest shape exactly."""
+    """Equal cells over shapes, in the frame of the largest one. Along each axis they fit the thinnest shape exactly."""
 
     solids: list[Solid]  # shapes posed in the frame of the grid
     earlier: int  # number of leading ``solids`` that get no cells and only remove overlap
@@ -69,7 +69,7 @@ class CellGrid:
         return ((grid(self.splits) + 0.5) / self.splits - 0.5) * self.sides
 
     def _hits_along_axes(self, part: Solid, others: list[Solid]) -> tuple[np.ndarray, np.ndarray, int]:
-        """Return :meth:`_hits` of a shape in the frame of the grid, whose test points are a grid along its axes."""
+        """Return :meth:`_hits` of a shape that has the frame of the grid, from test points in a grid along its axes."""
         first = np.maximum(np.floor((part.lower - self.lower) / self.sides).astype(int) - 1, 0)
         last = np.minimum(np.ceil((part.upper - self.lower) / self.sides).astype(int) + 1, self.counts)
         size = int(self.splits.prod())
@@ -102,8 +102,8 @@ class CellGrid:
     def _hits(self, part: Solid, others: list[Solid]) -> tuple[np.ndarray, np.ndarray, int]:
         """Return the cells with a test point in a shape outside ``others``, shape [m, 3], and these points.
 
-        Points in the shape are marked, shape [m, points of a cell]. The third value is the number of points in the
-        shape, including overlap.
+        The second value is True for these points, shape [m, points of a cell]. The third value is the number of points
+        in the shape, including overlap.
         """
         index, offsets = self._cells_near(part), self._offsets()
         cells = self.lower + (index + 0.5) * self.sides
@@ -123,7 +123,7 @@ class CellGrid:
         steps = (0.5 * self.sides[:, None] / np.maximum(rotation, 1e-9)).min(axis=0)  # along each axis of the shape
         points = part.test_points(self._point_counts(extent / steps))
         index, size = np.floor((points - self.lower) / self.sides).astype(int), self.counts + 4
-        index = np.clip(index, -2, self.counts + 1) + 2  # not negative, even of the neighbors
+        index = np.clip(index, -2, self.counts + 1) + 2  # indices of neighbors are not negative, either
         index = np.stack(np.unravel_index(np.unique(np.ravel_multi_index(tuple(index.T), size)), size), axis=1)
         index = np.clip(index[:, None] + grid(np.full(3, 3)) - 1, 0, size - 1).reshape(-1, 3)  # with their neighbors
         index = np.stack(np.unravel_index(np.unique(np.ravel_multi_index(tuple(index.T), size)), size), axis=1) - 2
@@ -184,7 +184,7 @@ def cells_over(parts: Sequence[Solid], earlier: Sequence[Solid], spacing: float,
     cells_before = np.ceil((face - lower) / sides - 1e-6)
     counts = (cells_before + np.ceil((upper - face) / sides - 1e-6)).astype(int)
     splits = np.maximum(np.ceil(_FINE_POINTS * sides / thin - 1e-6).astype(int), 1)
-    coarsest = 2 if len(parts) == 1 else 4  # 8 subcells in place of 3 or 4 give a hammer an eigenvalue of -0.0005
+    coarsest = 2 if len(parts) == 1 else 4  # a hammer of two shapes has an eigenvalue of -0.0005 with 8 instead
     splits = np.where(splits > coarsest, -(-splits // 8) * 8, 4)  # demagnetizing tensors use 8 or 4 subcells
     splits = splits if len(parts) == 1 else np.minimum(splits, _MOST_SPLITS)
     lower = face - cells_before * sides
@@ -194,7 +194,7 @@ def cells_over(parts: Sequence[Solid], earlier: Sequence[Solid], spacing: float,
 def _fit_steps(part: Solid, fit: np.ndarray, across: int) -> np.ndarray:
     """Return numbers of cells along each axis near ``fit`` for which faces of the shape lie between cells.
 
-    A face inside a cell costs its area times the square of its distance from the cell's next face.
+    A face inside a cell costs its area times the square of its distance from the nearest face of the cell.
     """
     extent, result = part.upper - part.lower, fit.copy()
     for axis in range(3):

@@ -12,11 +12,12 @@ _CHUNK = 1 << 18
 
 
 _SAME_PLANE = 1e-5
-"""Relative distance up to which parallel faces are in one plane, and sine up to which they are across an axis."""
+"""Relative distance up to which parallel faces are in one plane. Also 1 − cosine of the angle up to which the normal of
+a face counts as parallel to an axis."""
 
 
 def steps_of(corners: np.ndarray) -> np.ndarray:
-    """Return the planes across an axis that have triangles, except those that bound the mesh, shape [f, 3].
+    """Return the planes normal to an axis that contain triangles, except those that bound the mesh, shape [f, 3].
 
     A row holds the axis, the coordinate [m] and the area of its triangles [m²]. ``corners`` [m] have the shape
     [k, 3, 3].
@@ -73,7 +74,7 @@ def winding_number(points: np.ndarray, triangles: np.ndarray) -> Callable[..., n
 
     The coordinates broadcast. In a grid along the axes, all points of a line along z share a ray.
 
-    The function counts the triangles that a ray along +z crosses. A ray through an edge or a vertex counts exactly
+    The function counts the triangles that a ray along +z crosses. A crossing at an edge or a vertex counts exactly
     once: the side of an edge is computed from its end points in the order of their indices, and is thus the same for
     both triangles. Triangles are sorted into rectangular columns along z: a ray tests the triangles of its column.
     """
@@ -103,7 +104,8 @@ def winding_number(points: np.ndarray, triangles: np.ndarray) -> Callable[..., n
 def _ray_crossings(points: np.ndarray, triangles: np.ndarray) -> Callable[[np.ndarray], tuple[np.ndarray, ...]]:
     """Return a function of rays along z through (x, y), shape [n, 2], that returns where they cross a mesh.
 
-    It returns z [m] and the sign of the normal's z of each crossing, by ray, and the number of crossings of each ray.
+    The function returns z [m] and the sign of the normal's z of each crossing, sorted by ray. It also returns the
+    number of crossings of each ray.
     """
     corners = points[triangles]
     flat = corners[:, :, :2]

@@ -1,14 +1,14 @@
 """Tables of the potential around uniformly magnetized cylinders, from which a device interpolates potential and field.
 
 The scalar potential of a magnetization M is M·G. With the potentials P of the faces and their normals n, G = Σ n P, as
-in ``polyhedra.py``. Around a cylinder G has a component along the axis and a radial component, which depend on the
-distances ρ from the axis and z from the middle. Both are integrals over the angle φ around the axis, with c = cos φ,
-D² = ρ² + R² − 2 ρ R c, w = z ∓ h and S = √(D² + w²):
+in ``polyhedra.py``. Around a cylinder of radius R and half height h, G has a component along the axis and a radial one.
+Both depend on the distances ρ from the axis and z from the middle. They are integrals over the angle φ around the axis,
+with c = cos φ, D² = ρ² + R² − 2 ρ R c, w = z ∓ h and S = √(D² + w²):
 
     4π G_z = R Σ ± ∫ (R − ρ c) (S − |w|)/D² dφ,    4π G_ρ = −R Σ ± ∫ c arsinh(w/D) dφ.
 
 The first integral contains the boundary terms of ∫ dA/r over the end faces at z = ±h (divergence theorem). The second
-is over 1/r along the lines of the curved face. Nodes of the table are a geometric series away from the rim, where
+is over 1/r along the lines of the curved face. The spacing of nodes grows geometrically away from the rim, where
 derivatives of G are infinite. Each node has G, its first derivatives and its mixed derivative. Bicubic Hermite
 interpolation (``kernels/applied/cylinder.h``) is then continuous in its first derivatives, so that forces are
 derivatives of the energy. The field has a relative error of 1e-4. Nearer to the rim than 1/2000 of the smaller of R and
@@ -21,7 +21,7 @@ from functools import cache
 import numpy as np
 
 _PER_FOLD, _FINEST = 8.0, 16.0
-"""Nodes per factor e of the distance from the rim; the smaller of R and h over the distance that has one node more."""
+"""κ in the distances s (exp(k/κ) − 1) of the nodes k from the rim; the smaller of R and h over s, about."""
 _REACH = 24.0
 """Reach of the table, in multiples of the larger of R and h. A dipole has an error of 1e-3 there."""
 _ANGLES, _AT_RIM, _OFF_WALL = 96, 1.0 / 16.0, 1e-3
@@ -32,10 +32,9 @@ _ANGLES, _AT_RIM, _OFF_WALL = 96, 1.0 / 16.0, 1e-3
 def potential_table(radius: float, half_height: float) -> np.ndarray:
     """Return the table of a cylinder along z at the origin, flat, as ``kernels/applied/cylinder.h`` takes it.
 
-    The first ten numbers are R, h [m], the distances with one more node from the rim [m] and numbers of nodes from the
-    axis and from the middle up to the rim, for ρ and z; the number of nodes of ρ, and of z; nodes per factor e; reach
-    [m]. Then follow, for G_z and G_ρ, at each node (ρ, z): G, ∂G/∂ρ, ∂G/∂z and ∂²G/∂ρ∂z [m], with ρ and z in node
-    spacings.
+    The first ten numbers are R, h [m]; s of :func:`_nodes` for ρ and for z [m]; the numbers of nodes before the rim for
+    ρ and for z; the numbers of all nodes of ρ and of z; κ of :func:`_nodes`; reach [m]. Then follow, for G_z and G_ρ,
+    at each node (ρ, z): G, ∂G/∂ρ, ∂G/∂z and ∂²G/∂ρ∂z [m], with ρ and z in node spacings.
 
     Args:
         radius: R [m].
@@ -60,7 +59,7 @@ def potential_table(radius: float, half_height: float) -> np.ndarray:
 def _nodes(edge: float, finest: float, reach: float) -> tuple[np.ndarray, np.ndarray, float, int]:
     """Return nodes from 0 on to ``reach`` beyond ``edge`` [m], and spacings there.
 
-    The distance of node k from the edge, counted from it, is ± s (exp(k/κ) − 1). Also returns s and the number of
+    Node k from the edge has the distance s (exp(k/κ) − 1), with κ = :data:`_PER_FOLD`. Also returns s and the number of
     nodes before the edge.
     """
     before = max(1, round(_PER_FOLD * math.log1p(edge / finest)))

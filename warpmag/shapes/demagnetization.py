@@ -32,8 +32,8 @@ EXACT_REACH = 3.0, 6.0
 
 _NEAR_CELLS = 114
 """Number of cells within the smallest reach in a block of cubes. Rods and sheets have fewer there, so their reach grows
-until it holds as many cells. With dipoles from 3 sides on, the operator of rods of 1:40 is negative; with dipoles from
-6 sides on, its error is 1e-4 to 1e-5."""
+until it holds as many cells. With dipoles from 3 sides on, the operator of rods of 1:40 has negative eigenvalues. With
+dipoles from 6 sides on, its error is 1e-4 to 1e-5."""
 
 _SUBCELLS = 8
 """Largest number of subcells along each axis of a cell that the surface cuts. Coarser subcells for pairs that do not
@@ -43,8 +43,8 @@ _FAR_REACH = 4.0
 """Distance up to which quadrupoles of cells are corrected, in reaches of the exact tensors."""
 
 _LARGEST_SPREAD = 0.15
-"""Bound on the norm of the traceless second moments of a moment's volume, in squares of a cell's longest side. Two
-joined cubic cells have 0.2."""
+"""Bound on the norm of the traceless mean of x xᵀ over the volume of a moment, about its centroid. In squares of the
+longest side of a cell; two joined cubic cells have 0.2."""
 COMPONENTS = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
 """Rows and columns of the six components of a symmetric tensor: xx, yy, zz, xy, xz, yz."""
 _BATCH = 1 << 22
@@ -68,7 +68,7 @@ class Slopes:
 
     neighbor: np.ndarray  # neighbor of each cell on each side, the cell itself where there is none, shape [n, 6]
     weight: np.ndarray  # weights w of the neighbors, shape [n, 6]
-    layer: np.ndarray  # factors of differences across layers of one cell (``linear_cells.py``), shape [n, 3]
+    layer: np.ndarray  # factors of differences along axes without neighbors (``linear_cells.py``), shape [n, 3]
     tensor: np.ndarray  # T_ij [1/m³] for the entries of the coupling, H_i += Σ T_ij m_j, shape [entries, 3, 3]
     alone: LoneSlopes | None  # changes in a world without other iron; None if ``tensor`` contains them
 
@@ -164,7 +164,7 @@ class Coupling:
 
     @property
     def layer(self) -> np.ndarray:
-        """Factors of differences across layers of one cell, 0 for uniform cells, shape [n, 3]."""
+        """Factors of differences along axes without neighbors, 0 for uniform cells, shape [n, 3]."""
         return np.zeros((len(self.radii), 3)) if self.slopes is None else self.slopes.layer
 
 
@@ -188,7 +188,7 @@ def couplings_in_worlds(
 
 
 def pair_law_tensors(positions: np.ndarray, radii: np.ndarray) -> np.ndarray:
-    """Return the tensors of the sums over pairs between n balls [1/m³], 0 for a ball itself, shape [n, n, 6]."""
+    """Return the field tensors between n balls [1/m³], 0 between a ball and itself, shape [n, n, 6]."""
     n = len(radii)
     i, j = np.divmod(np.arange(n * n), n)
     law = _pair_law(positions[i] - positions[j], radii[i], radii[j], i == j)
@@ -304,7 +304,7 @@ def _pair_law(r, a, b, same):
 
 
 def _part_tensors(part: Pieces, lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
-    """Return near moments of a grid, shape [2, pairs], and N_ij √(V_i V_j) over a cell's volume, shape [pairs, 6]."""
+    """Return pairs of near moments, shape [2, pairs], and N_ij √(V_i V_j) over a cell's volume, shape [pairs, 6]."""
     first, count = int(part.moment.min()), len(np.unique(part.moment))
     local = (lattice.positions[first : first + count] - part.position) @ part.rotation
     reach = _reach(local, float(part.sides.max()))
@@ -341,7 +341,7 @@ def _second_moments(part: Pieces, first: int, volume: np.ndarray) -> np.ndarray:
 
 
 def _spreads(part: Pieces, first: int, volume: np.ndarray) -> np.ndarray:
-    """Return the second moments of each moment's volume about its centroid, per volume, shape [n, 3, 3]."""
+    """Return the mean of x xᵀ over the volume of each moment, about its centroid [m²], shape [n, 3, 3]."""
     split = np.array(part.filled.shape[1:])
     points, weights = (grid(split) + 0.5) / split * part.sides, part.filled.reshape(len(part.filled), -1) / split.prod()
     corner, zeroth = part.index * part.sides, weights.sum(axis=1)[:, None]

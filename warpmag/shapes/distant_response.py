@@ -9,14 +9,14 @@ the cells up to the tolerance if their response P has EᵀPE = Q. With the pseud
 
 with fields and magnetizations times the roots of volumes, so that a uniform magnetization stays uniform. The second
 term lets the moments respond to other fields as well, so that P has an inverse: the moments follow a magnetization
-curve like cells. Their own field is T = (1/3 − P⁻¹)/V, since a ball of ideal permeability has the response 3. The
-points are means of cells, so that they are inside the body.
+curve like cells. Their own field is T = (1/3 − P⁻¹)/V, since a ball of ideal permeability has the response 3. Each
+point is the centroid of a group of cells.
 
-There are several levels, :data:`FEW_LEVELS`: the nearer the surface, the more combinations and points. The distance
-that a body needs follows from the forces on ball magnets around it, which act as dipoles. The diameter of each ball
-equals its distance from the body. At the distance of a level the largest error of these forces, over several places and
-directions, is at most :data:`BALL_ERROR`. It falls with the third power of the distance or faster. The median error is
-a fifth of the largest, and errors for larger magnets are smaller.
+There are several levels, :data:`FEW_LEVELS`: the nearer the surface, the more combinations and points. The smallest
+distance of a level follows from the forces on ball magnets around the body, which act as dipoles. The diameter of each
+ball equals its distance from the body. At the smallest distance of a level the largest error of these forces, over
+several places and directions, is at most :data:`BALL_ERROR`. It falls with the third power of the distance or faster.
+The median error is a fifth of the largest, and errors for larger magnets are smaller.
 """
 
 import math
@@ -45,14 +45,14 @@ LEAST_REPLACED_CELLS = 65
 MOST_REPLACED_CELLS = 1000
 """Largest number of cells of bodies that get few moments. More would need a larger matrix than 72 MB."""
 _SOURCE_SPACING = 0.75
-"""Largest distance of the charges on the surface, in distances of the surface from the body."""
+"""Largest spacing of the charges on the surface, in distances of the surface from the body."""
 _LEAST_FIELD = 0.003
-"""Least strength of a combination of fields at the cells, and of one at the points, over the largest. Weaker ones get
-no response."""
+"""Smallest singular value of a combination of fields that gets a response, over the largest, at the cells and at the
+points."""
 _TESTS = 24
 """Number of dipoles whose forces are compared."""
 _OTHER_RESPONSE = 1.0
-"""Response ε to other fields: that of a sheet across itself."""
+"""Response ε to other fields: that of a sheet to a field normal to it."""
 
 
 @dataclass(frozen=True)
@@ -139,8 +139,8 @@ def _few_moments(
 ) -> DistantBody | None:
     """Return the moments of a level.
 
-    ``basis`` is :func:`_basis` at the cells, ``patterns`` are their magnetizations. ``tests`` are the fields of dipoles
-    at ``balls`` there, and ``magnetized`` their magnetizations.
+    ``basis`` is :func:`_basis` at the cells, and ``patterns`` are the magnetizations of the cells in these fields.
+    ``tests`` are the fields at the cells of dipoles at ``balls``, and ``magnetized`` the magnetizations in them.
     """
     volumes, part, (cells, combinations) = body.volumes, _parts(body.positions, level.most_points), basis
     shares = np.bincount(part, volumes)
@@ -156,7 +156,7 @@ def _few_moments(
         and np.isfinite(patterns).all()
         and np.linalg.eigvalsh(inverse_response)[0] > 0.0
     ):
-        return None  # cells of wires of lengths beyond 1e9 radii
+        return None  # rounding, in wires longer than 1e9 radii
     few, expected = _Tests.at(balls, points, shares), tests.forces(magnetized)
     error = np.linalg.norm(few.forces(response @ few.fields) - expected, axis=0) / np.linalg.norm(expected, axis=0)
     root, cell_root = np.repeat(np.sqrt(shares), 3), np.repeat(np.sqrt(volumes), 3)

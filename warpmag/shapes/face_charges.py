@@ -13,9 +13,9 @@ different faces do not act on each other, because their fields fall off fast.
 The part of q that varies linearly over a face is too large where the field is smooth. Over an ideal half-space a
 potential cos kx at the surface induces the charges 2 k cos kx. Along a face of side l they vary by up to 2 k² l. The
 average field of a cell is the field at half its depth d. After it is subtracted, φ has a slope of up to k² d/2, to
-second order in k. R turns this slope into charges that vary by k² d/(2 c) with c = 0.09. The exact charges are 4 c l/d
-= 0.36 l/d times these. Near edges of magnets, up to all of q is needed. So the linear part of q along a side is
-multiplied by :data:`_LINEAR` l/d, at most 1.
+second order in k. R turns this slope into charges that vary by k² d/(2 c), with c = 0.09 for a square. The exact
+charges are 4 c l/d = 0.36 l/d times the charges from R. Near edges of magnets, up to the whole linear part is needed.
+So the linear part of q along a side is multiplied by :data:`_LINEAR` l/d, at most 1.
 """
 
 from functools import cache

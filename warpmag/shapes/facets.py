@@ -15,7 +15,7 @@ _LEAST_PER_SIDE = 3
 _TEST_OFFSET = 1e-4
 """Distance of the test points on both sides of a facet from its center, in square roots of its area."""
 _FLAT = 1e-6
-"""Height of a triangle over its longest side up to which it has no area, in single precision."""
+"""Ratio of height to longest side up to which a triangle of float32 corners counts as one without area."""
 
 
 def box(half_extents: np.ndarray, count: int) -> np.ndarray:

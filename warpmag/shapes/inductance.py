@@ -21,11 +21,11 @@ MU0 = 4e-7 * np.pi
 _MEAN_DISTANCE = float(np.exp(-0.25))
 """Geometric mean distance within a circle with uniform current, over its radius."""
 _LEAST_SHARE = 0.01
-"""Smallest inductance that a winding may be given, over that of its geometry. The wire of a loop may be 50 times as
-thick as by default, which reduces the inductance to a fifth."""
+"""Smallest declared inductance of a coil, over the computed one. The wire of a loop may be 50 times as thick as by
+default, which reduces the inductance to a fifth."""
 _HEIGHTS, _FILAMENTS, _ANGLES, _PIECES = 24, 37, 128, 48
-"""Loops of a sheet for A, and for its filaments, which then avoid the loops of an equal sheet; points of a circle, and
-points of a straight piece."""
+"""Numbers of loops that replace a sheet as the source of A and as filaments; of points of a circle; of points of a
+straight piece. The first two differ, so that filaments do not coincide with the loops of an equal sheet."""
 
 
 def self_inductance(record: SourceRecord) -> float:
@@ -110,7 +110,10 @@ def _nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _flux(record: SourceRecord, points: np.ndarray, steps: np.ndarray, *, wire: float) -> float:
-    """Return ∫ A·dl along filaments [Wb], for one ampere-turn; distances are at least the mean one of ``wire`` [m]."""
+    """Return ∫ A·dl along filaments [Wb], for one ampere-turn.
+
+    Distances are at least the geometric mean distance of a wire of radius ``wire`` [m].
+    """
     nearest = wire * _MEAN_DISTANCE
     if record.kind == "polyline":
         pieces = itertools.pairwise(record.table)

@@ -68,9 +68,10 @@ LONGEST = 1.25
 rod."""
 
 _JOINED = 0.35, 0.5
-"""Shares of a whole cell below which a cell joins a neighbor, in bodies of one shape and of several. Joined cells are
-not boxes, as which cells of different bodies act on each other: at a half, forces in a stack of five discs were wrong
-by factors of 2 to 4. Several shapes share cells, so a third would leave many small parts."""
+"""Shares of a whole cell below which a cell joins a neighbor, in bodies of one shape and of several. Near cells of
+different bodies act on each other as boxes, but joined cells are not boxes: with a half for one shape, forces in a
+stack of five discs were wrong by factors of 2 to 4. Several shapes share cells: a third would leave many small
+parts."""
 
 _STEP = 1.02
 """Ratio of successive trial spacings."""
@@ -276,9 +277,10 @@ def fill(
 
 
 def _steps(lattice: Lattice, most: int) -> int:
-    """Return a number of steps of the spacing. Only after the last step can at most ``most`` moments be left.
+    """Return the number of steps by which the spacing grows before the next fill.
 
-    The number of cells in a row, as in a wire, falls as the spacing grows. All else takes single steps.
+    It is 1, except for cells in a row, as in a wire: their number is inversely proportional to the spacing, so steps
+    that would leave more than ``most`` moments are skipped.
     """
     if len(lattice.pieces) > 1 or np.count_nonzero(np.ptp(lattice.pieces[0].index, axis=0)) > 1:
         return 1
@@ -288,7 +290,7 @@ def _steps(lattice: Lattice, most: int) -> int:
 def _automatic_cells(
     parts: Sequence[Solid], across: int, most: int, together: bool
 ) -> tuple[float, int, list[CellGrid]]:
-    """Return the spacing [m] at which the shapes have the volume of at most ``most`` cells, cells across, and grids."""
+    """Return a spacing [m], the number of cells across a shape, and grids of at most ``most`` cells by volume."""
     first = (sum(p.volume for p in parts) / AUTOMATIC_COUNT) ** (1.0 / 3.0)
     widest = max((p.upper - p.lower).max() for p in parts)
     for fewer in range(across, 0, -1):
@@ -316,7 +318,7 @@ def _is_nearly_cubic(sides: np.ndarray) -> bool:
 
 
 def _cell_volumes(grids: Sequence[CellGrid]) -> float:
-    """Return the number of cells that have the volume of the shapes over which the grids are."""
+    """Return the total volume of the shapes of grids, in cells."""
     return sum(part.volume / cells.sides.prod() for cells in grids for part in cells.solids[cells.earlier :])
 
 

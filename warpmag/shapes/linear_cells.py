@@ -148,7 +148,7 @@ class _Operator:
         scale = self._root[self.row] * self._root[self.other]
         own = self.row == self.other
         self._of_means = full_tensors(rotated(coupling.tensor, part.rotation.T)) * scale[:, None, None]
-        self._of_means[own] -= np.eye(3) / 3.0  # the magnetization curve's share, which is of the cell itself
+        self._of_means[own] -= np.eye(3) / 3.0  # the curve of a ball contains 1/3 of the cell's own field
         offsets, inverse = np.unique(index[self.row] - index[self.other], axis=0, return_inverse=True)
         shares = (scale * _fading((offsets * part.sides)[inverse.reshape(-1)]) / part.sides.prod())[:, None, None]
         self._differences = [-block[inverse.reshape(-1)] * shares for block in half_cell_tensors(offsets, part.sides)]

@@ -14,9 +14,9 @@ import functools
 import numpy as np
 
 _INVERTED = 1e-6
-"""Area of an inverted triangle of a fan, as a share of its polygon's area, that single precision explains."""
+"""Area of an inverted triangle of a fan that rounding to float32 explains, as a share of the area of its polygon."""
 _FLAT = 1e-6
-"""Height of a corner over the longest side of its triangle up to which the corner is straight, in single precision."""
+"""Ratio of height to longest side of the triangle at a corner up to which a corner of float32 counts as straight."""
 
 
 def triangulate(points: np.ndarray, counts: np.ndarray, indices: np.ndarray) -> np.ndarray:

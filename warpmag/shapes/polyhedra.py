@@ -8,9 +8,10 @@ two ends only.
 
 Force and torque on a body are integrals over the charges M·n of its faces. Stokes' theorem turns them into line
 integrals of the potentials φ = M·G and a = M×G of the other body, which are continuous everywhere. The force in the
-plane of a face is −∮ φ ν dl, and the force normal to it is n ∮ a·dl: integrals over edges. The torque of a face also
-needs an integral over its area, ∫ (a − n n·a) dA. Between touching bodies, the normal B and the tangential H are
-continuous, so that a small interpenetration changes the force only a little.
+plane of a face with the normal n is −∮ φ ν dl. Here ν is the outward normal of an edge in this plane. The force normal
+to the face is n ∮ a·dl. Both are integrals over edges. The torque of a face also needs an integral over its area,
+∫ (a − n n·a) dA. Between touching bodies, the normal B and the tangential H are continuous, so that a small
+interpenetration changes the force only a little.
 """
 
 import math
@@ -24,21 +25,21 @@ from warpmag.shapes.cylinder_potential import potential_table
 CYLINDER_SIDES = 32
 """Number of sides of the prism that replaces a cylinder."""
 _LEAST_POINTS, _EDGE_POINTS, _FACE_POINTS, _FINE_FACE_POINTS = 4, 16, 8, 32
-"""Numbers of Gauss points: minimum on an edge; on the longest edge; across a face as long as that edge; and across such
-a face for energies. Forces between touching boxes then have an error of 2e-3 at any offset. Only torques and energies
-use points on faces. The potential has a kink on a face near an edge of the other body. For two boxes half a millimeter
-apart, 8 points give the force to 1e-5, but the slope of the energy only to 3 %; energies therefore use more."""
+"""Numbers of Gauss points: the smallest on an edge; on the longest edge; across a face as long as that edge, for
+torques; and for energies. Forces between touching boxes then have an error of 2e-3 at any offset. Forces use no points
+on faces. The potential has a kink on a face near an edge of the other body. For two boxes half a millimeter apart, 8
+points give the force to 1e-5, but the slope of the energy only to 3 %; energies therefore use more."""
 _RIM_POINTS = 256
 """Number of points on each rim of a cylinder magnetized along its axis. Forces between overlapping ends of discs of
-50:1 then have an error of 4e-4, thicker ones of 1e-5. With 128 points it would be 1e-3."""
+50:1 then have an error of 4e-4, those of thicker discs 1e-5. With 128 points it would be 1e-3."""
 _REACH, _REMAINDER, _MOST_MOMENTS = 1.5, 1e-5, 256
 """For the moments that replace a body at a distance: smallest distance, in halves of the body's smallest side; relative
 error of the field there from the Gauss points along one axis; largest number of moments. If more moments were needed,
 the distance is increased."""
 _FAR_REACH, _FAR_REMAINDER = 5.0, 1.2e-4
 """For the few moments that replace a body farther off: smallest distance, in halves of the body's largest side, and
-relative error along one axis. A cube and a disc have 8, slender boxes 2. Gradients of their fields have an error of up
-to 5e-3 there, which falls off with the fourth power of the distance."""
+relative error along one axis. A cube and a disc have 8 moments, slender boxes 2. Gradients of their fields have an
+error of up to 5e-3 there, which falls off with the fourth power of the distance."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,7 @@ class Moments:
     """Moments at Gauss points that replace a body at a distance; there, gradients of their field have an error of 1e-3.
 
     Lattice cells that are not cubes, or that a surface cuts, have an error of 1e-2 at any distance. Beyond a larger
-    distance, the few moments of :func:`far_box_moments` and :func:`far_cylinder_moments` do.
+    distance, the few moments of :func:`far_box_moments` and :func:`far_cylinder_moments` suffice.
     """
 
     positions: np.ndarray  # [m], shape [n, 3]
@@ -255,7 +256,7 @@ def _planned(half: float, plan):
     The distance is the smallest from ``_REACH * half`` on with a plan of at most :data:`_MOST_MOMENTS` moments.
     """
     distance = _REACH * half
-    while math.prod(map(math.prod, plan(distance))) > _MOST_MOMENTS:  # beyond 64 bits for foils
+    while math.prod(map(math.prod, plan(distance))) > _MOST_MOMENTS:  # counts of foils exceed 64 bits
         distance *= 1.1
     return plan(distance), distance
 

@@ -21,8 +21,8 @@ class Solid:
     centroid: np.ndarray  # [m], shape [3]
     inside: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # True inside, from x, y, z [m] that broadcast
     facets: Callable[[int], np.ndarray]  # about a given number m of facets of the surface [m], shape [m, 4, 3]
-    steps: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))  # faces across an axis inside the bounding box:
-    # axis, coordinate [m] and area [m²], shape [f, 3]
+    steps: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))  # faces inside the box,
+    # normal to an axis: axis, coordinate [m] and area [m²], shape [f, 3]
     position: np.ndarray = field(default_factory=lambda: np.zeros(3))  # origin in the body's frame [m], shape [3]
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))  # rotation to the body's frame, shape [3, 3]
 

@@ -2,10 +2,10 @@
 
 Without a correction the moment of the cells (``demagnetization.py``, ``linear_cells.py``) is too small: by up to two
 thirds with one or two uniform cells across the strokes of a letter, by up to 5 % with linear cells. The response of an
-ideally permeable body follows from its surface alone, which is at one potential: (1/4π) ∫ σ/‖x − y‖ dA = ψ. In a
-uniform field H0, ψ = H0·x, and the moment is ∫ σ x dA. The charge σ is taken as constant on facets (``facets.py``). The
-potential of a facet is a closed form (Wilton et al., IEEE Trans. Antennas Propag. 32 (1984) 276). The response of the
-cells is solved directly, or by conjugate gradients if there are many.
+ideally permeable body follows from its surface alone, which is at one potential. In a uniform field H0 its charges σ
+obey (1/4π) ∫ σ/‖x − y‖ dA = H0·x + const, and the moment is ∫ σ x dA. The charge σ is constant on facets
+(``facets.py``). The potential of a facet is a closed form (Wilton et al., IEEE Trans. Antennas Propag. 32 (1984) 276).
+The response of the cells is solved directly, or by conjugate gradients if there are many.
 
 Let P be the polarizability of the cells and Q that of the surface. The correction adds a uniform field of C = P⁻¹ − Q⁻¹
 times the moment of the body to all cells. By Woodbury's formula the response to a uniform field becomes Q. Because Q is
@@ -47,7 +47,7 @@ _MOST_STEPS = 120
 thousands of cells, are not corrected: each step of 3,000 cells takes 0.1 s."""
 _MATRIX_CELLS = 1000
 """Largest number of cells whose response is solved directly, with a matrix of 72 MB: exact also for wires, for which
-conjugate gradients do not converge. Each costs about 1 s at this number."""
+conjugate gradients do not converge. A direct solution takes about 1 s at this number."""
 _CHUNK = 1 << 18
 """Pairs of facets evaluated at a time (some tens of MB)."""
 

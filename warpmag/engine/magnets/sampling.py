@@ -1,4 +1,4 @@
-"""Samples Newton's shapes with moments."""
+"""Sampling of Newton's shapes: the moments that represent them."""
 
 import contextlib
 from dataclasses import dataclass
@@ -24,8 +24,8 @@ from warpmag.shapes.uniform_response import with_surface_response
 _REACH = 3.0
 """Distance up to which the closed form of a magnet replaces its lattice of cells, in cell sizes."""
 _LARGEST_CLOSED_FORM = 4096
-"""Largest number of moments of a permanent magnet whose near field has a closed form. Only fields of coils and field
-maps are the more accurate for more of them. The force between two magnets near each other visits all pairs of them."""
+"""Largest number of moments of a permanent magnet whose near field has a closed form. More moments make only the fields
+of coils and maps more accurate. The force between two magnets near each other visits all pairs of moments."""
 _ROUNDING = 1e-5
 """Relative difference up to which sizes and frames of shapes are equal: 80 units in the last place of float32. Frames
 come from products of transforms, which round differently for each instance of a prototype."""
@@ -37,7 +37,7 @@ _SOLIDS = {
     newton.GeoType.BOX: (lattice.box, 3),
     newton.GeoType.ELLIPSOID: (lattice.ellipsoid, 3),
 }
-"""Solid of each type of shapes without a mesh, and the number of its lengths in the scale of the shape."""
+"""Function that returns the solid of a type of shapes, and the number of lengths in the scale of the shape."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class ClosedForm:
     shape: Polyhedron  # surface, in the frame of the body
     reach: float  # largest distance at which the closed form is used [m]
     moments: Moments  # moments at larger distances, in the frame of the body
-    far_reach: float = 0.0  # largest distance at which they are used [m], if the magnet has fewer moments
+    far_reach: float = 0.0  # largest distance at which ``moments`` are used [m], if the magnet itself has fewer
 
 
 @dataclass(frozen=True)
