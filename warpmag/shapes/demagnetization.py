@@ -260,7 +260,6 @@ def coupling(lattice: Lattice, radii: np.ndarray) -> Coupling:
     for part in lattice.pieces:
         (i, j), exact = _part_tensors(part, lattice)
         entries.append(np.stack([i, j]))
-        exact = -exact / np.sqrt(volumes[i] * volumes[j])[:, None]
         tensors.append(exact - _pair_law(x[i] - x[j], radii[i], radii[j], i == j))
     (i, j), tensor = np.concatenate(entries, axis=1), np.concatenate(tensors)
     order = np.lexsort((j, i))
@@ -304,7 +303,12 @@ def _pair_law(r, a, b, same):
 
 
 def _part_tensors(part: Pieces, lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs of near moments, shape [2, pairs], and N_ij √(V_i V_j) over a cell's volume, shape [pairs, 6]."""
+    """Return pairs of near moments, shape [2, pairs], and the field of one averaged over the other [1/m³], [pairs, 6].
+
+    Moments are spread over volumes of test points. A factor that makes the body's volume exact is left out. With it
+    near cells would have more or less charge than distant ones, like gaps between cells: letters in contact attracted
+    each other 9 % less.
+    """
     first, count = int(part.moment.min()), len(np.unique(part.moment))
     local = (lattice.positions[first : first + count] - part.position) @ part.rotation
     reach = _reach(local, float(part.sides.max()))
@@ -326,7 +330,9 @@ def _part_tensors(part: Pieces, lattice: Lattice) -> tuple[np.ndarray, np.ndarra
     sums = np.stack([np.bincount(pair, weight * values[:, c], len(i)) for c in range(6)], axis=1)
     sums /= np.sqrt(volume[i] * volume[j])[:, None]
     own, spreads = i == j, _second_moments(part, first, volume)
-    sums[own] += _far_corrections(local, part.sides.prod() * volume, spreads, reach)[i[own]]
+    volume = part.sides.prod() * volume
+    sums[own] += _far_corrections(local, volume, spreads, reach)[i[own]]
+    sums /= -np.sqrt(volume[i] * volume[j])[:, None]
     distinct = i != j
     pairs = np.concatenate([np.stack([i, j]), np.stack([j[distinct], i[distinct]])], axis=1) + first
     return pairs, rotated(np.concatenate([sums, sums[distinct]]), part.rotation)
