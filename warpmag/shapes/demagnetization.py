@@ -92,7 +92,7 @@ class Coupling:
     common: np.ndarray  # C [1/m³] (``uniform_response.py``), shape [3, 3]
     positions: np.ndarray  # positions of the moments [m], shape [n, 3]
     radii: np.ndarray  # radii of the moments' balls [m], shape [n]
-    half_sides: np.ndarray  # boxes with the volumes and second moments of the cells, frame of the grid [m], [n, 3]
+    half_sides: np.ndarray  # boxes with the second moments of the cells, in the frame of the grid [m], shape [n, 3]
     outer_faces: np.ndarray  # True for the faces −x, +x, −y, ... of whole cells on the body's surface, shape [n, 6]
     cell_sides: np.ndarray  # sides of a whole cell [m], frame of the grid, shape [3]
     grid_rotation: np.ndarray  # from the frame of the grid to that of the body (x, y, z, w), shape [4]
@@ -266,17 +266,19 @@ def coupling(lattice: Lattice, radii: np.ndarray) -> Coupling:
     start = np.searchsorted(i[order], np.arange(len(volumes) + 1))
     (part,) = lattice.pieces  # the shapes of an inducible body share a grid
     return Coupling(
-        start, j[order], tensor[order], np.zeros((3, 3)), x, radii, _boxes(part, lattice.volumes),
+        start, j[order], tensor[order], np.zeros((3, 3)), x, radii, _boxes(part, len(volumes)),
         _outer_faces(part, len(volumes)), part.sides, quaternion_of(part.rotation), None,
     )  # fmt: skip
 
 
-def _boxes(part: Pieces, volumes: np.ndarray) -> np.ndarray:
-    """Return the half sides of the cells' boxes [m], shape [n, 3]."""
-    filled = np.bincount(part.moment, part.share * part.filled.mean(axis=(1, 2, 3))[part.piece])
-    squares = np.einsum("nkk->nk", _spreads(part, 0, filled))
-    half = np.sqrt(3.0 * squares)
-    return half * np.cbrt(volumes / (8.0 * half.prod(axis=1)))[:, None]
+def _boxes(part: Pieces, count: int) -> np.ndarray:
+    """Return the half sides of the cells' boxes [m], shape [count, 3].
+
+    Boxes have the second moments of the cells, about 1/V ∫ x² dV along each axis. So they are as long as the cell along
+    axes on which the surface does not cut it, and gaps between faces are right.
+    """
+    filled = np.bincount(part.moment, part.share * part.filled.mean(axis=(1, 2, 3))[part.piece], count)
+    return np.sqrt(3.0 * np.einsum("nkk->nk", _spreads(part, 0, filled)))
 
 
 def _outer_faces(part: Pieces, count: int) -> np.ndarray:
