@@ -39,7 +39,6 @@ autodoc_typehints = "none"  # docstrings state shapes and units, which types do 
 maximum_signature_line_length = 90
 autodoc_preserve_defaults = True
 napoleon_use_ivar = True
-napoleon_custom_sections = ["Warns"]
 # no links to other projects' pages, nor to names that are not public
 nitpick_ignore_regex = [("py:mod", ".*"), ("py:.*", r"(?!warpmag\.[A-Za-z_]+$).*")]
 
@@ -154,17 +153,24 @@ def _keep_figures_in_a_line(app, page, *_):
         text.parent.replace(text, marked)
 
 
-CODE = re.compile(r'(?<=<span class="pre">)[^<]{13,}')
-"""A word of code in HTML that is too long for a column on a phone."""
-PARTS = re.compile(r"(?<=[A-Za-z)\]][_:/.=])(?=[\w&])|(?<=[a-z])(?=[A-Z])")
+CODE = re.compile(r'<table.*?</table>|(?<=<span class="pre">)[^<]{29,}', re.DOTALL)
+CODE_IN_TABLE = re.compile(r'(?<=<span class="pre">)[^<]{13,}')
+"""Words of code in HTML that are too long for a line or a column on a phone."""
+PARTS = re.compile(
+    r"(?<=[A-Za-z)\]][_:/=])(?=\w\w|&)|(?<=[A-Za-z)\]]\.)(?=\w{4})|(?<=[a-z])(?=[A-Z])"
+)
 """Places in a name, a path or an assignment where a line may end."""
 
 
 def _break_codes(app, page, template, context, doctree):
     """Let long words of code continue on the next line at their parts. ``static/page.css`` forbids other breaks."""
-    context["body"] = CODE.sub(
-        lambda code: PARTS.sub("<wbr>", code[0]), context.get("body", "")
-    )
+
+    def broken(code):
+        if code[0].startswith("<table"):
+            return CODE_IN_TABLE.sub(lambda word: PARTS.sub("<wbr>", word[0]), code[0])
+        return PARTS.sub("<wbr>", code[0])
+
+    context["body"] = CODE.sub(broken, context.get("body", ""))
 
 
 def setup(app):
