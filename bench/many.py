@@ -157,7 +157,7 @@ def draw(lines, path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt  # noqa: PLC0415
 
-    figure, (times, accuracy) = plt.subplots(1, 2, figsize=(9.6, 4.2), layout="constrained")
+    figure, (times, accuracy) = plt.subplots(2, 1, figsize=(6.3, 7.6), layout="constrained")
     series: dict[tuple, list] = {}
     for line in sorted((line for line in lines if "seconds" in line), key=lambda line: line["count"]):
         series.setdefault((line["method"], line["rtol"], line["quantity"]), []).append(line)
@@ -175,7 +175,7 @@ def draw(lines, path: Path) -> None:
         axis.set(xscale="log", yscale="log", xlabel="moments", ylabel=quantity)
         axis.grid(True, alpha=0.3)
     figure.suptitle(f"{machine_of(lines[0])}, commit {lines[0]['commit']}")
-    figure.savefig(path, dpi=90, pil_kwargs={"optimize": True})
+    figure.savefig(path, dpi=160, pil_kwargs={"optimize": True})
     plt.close(figure)
 
 

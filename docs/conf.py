@@ -28,6 +28,7 @@ exclude_patterns = ["paper/*"]
 html_theme = "furo"
 html_title = f"warpmag {release}"
 html_static_path, html_css_files = ["static"], ["page.css"]
+html_favicon = "static/icon.svg"
 
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
@@ -38,7 +39,6 @@ autodoc_typehints = "none"  # docstrings state shapes and units, which types do 
 maximum_signature_line_length = 90
 autodoc_preserve_defaults = True
 napoleon_use_ivar = True
-napoleon_custom_sections = ["Warns"]
 # no links to other projects' pages, nor to names that are not public
 nitpick_ignore_regex = [("py:mod", ".*"), ("py:.*", r"(?!warpmag\.[A-Za-z_]+$).*")]
 
@@ -58,7 +58,10 @@ def _schema(prim) -> str:
         kind = f"{'uniform ' * (attribute.variability == Sdf.VariabilityUniform)}{attribute.typeName}"
         allowed = ", ".join(f"`{token}`" for token in attribute.allowedTokens or ())
         tokens = f" One of {allowed}." if allowed else ""
-        default = "" if attribute.default in (None, "") else f"`{attribute.default}`"
+        default = attribute.default
+        if isinstance(default, float):
+            default = float(f"{default:.7g}")  # USD stores 32 bits
+        default = "" if default in (None, "") else f"`{default}`"
         lines.append(
             f"| `{attribute.name}` | {kind} | {default} | {_one_line(attribute.documentation)}{tokens} |"
         )
@@ -150,7 +153,28 @@ def _keep_figures_in_a_line(app, page, *_):
         text.parent.replace(text, marked)
 
 
+CODE = re.compile(r'<table.*?</table>|(?<=<span class="pre">)[^<]{29,}', re.DOTALL)
+CODE_IN_TABLE = re.compile(r'(?<=<span class="pre">)[^<]{13,}')
+"""Words of code in HTML that are too long for a line or a column on a phone."""
+PARTS = re.compile(
+    r"(?<=[A-Za-z)\]][_:/=])(?=\w\w|&)|(?<=[A-Za-z)\]]\.)(?=\w{4})|(?<=[a-z])(?=[A-Z])"
+)
+"""Places in a name, a path or an assignment where a line may end."""
+
+
+def _break_codes(app, page, template, context, doctree):
+    """Let long words of code continue on the next line at their parts. ``static/page.css`` forbids other breaks."""
+
+    def broken(code):
+        if code[0].startswith("<table"):
+            return CODE_IN_TABLE.sub(lambda word: PARTS.sub("<wbr>", word[0]), code[0])
+        return PARTS.sub("<wbr>", code[0])
+
+    context["body"] = CODE.sub(broken, context.get("body", ""))
+
+
 def setup(app):
-    """Register the replacement of comments and the marks of figures. Sphinx calls this function."""
+    """Register the replacement of comments and the marks of figures and codes. Sphinx calls this function."""
     app.connect("source-read", _fill_in)
     app.connect("doctree-resolved", _keep_figures_in_a_line)
+    app.connect("html-page-context", _break_codes)

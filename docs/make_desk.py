@@ -62,7 +62,7 @@ def main():
         disc.location.z = height
         disc.keyframe_insert("location", frame=frame)
     bpy.ops.object.camera_add(
-        location=(0.16, -0.22, 0.14),
+        location=(0.2, -0.275, 0.205),
         rotation=(math.radians(63.0), 0.0, math.radians(36.0)),
     )
     scene = bpy.context.scene

@@ -45,6 +45,13 @@ VIEWS = {
     "worlds": (0.3, -0.9, 0.12),
 }
 """Directions from the bodies to the camera, where they are not those of the command."""
+SPHERES = {
+    "chain": ((0.0, 0.0, 0.0), 0.1),
+    "sorter": ((0.022, 0.0, 0.008), 0.055),
+}
+"""Center and radius [m] of what the camera sees, where bodies leave the place in which they start."""
+CAMERAS = {"falling_magnet": "auto"}
+"""Cameras of scenes, where the camera of the stage cuts bodies off."""
 PITCHES = {"worlds": (0.034, 0.0, 0.0), "compass_swarm": (0.0, 0.03, 0.0)}
 """Distance of neighboring worlds in pictures [m]."""
 SLOW = {"levitation": 5, "worlds": 3}
@@ -64,8 +71,8 @@ IRON, MAGNET, GROUND = (
 class Camera(newton.viewer.ViewerNull):
     """A viewer that keeps the pictures of the frames that it shows, with iron as metal and magnets in red."""
 
-    pitch, view = (0.0, 0.0, 0.0), None
-    """Distance of neighboring worlds [m], and direction from the bodies to the camera."""
+    pitch, view, sphere = (0.0, 0.0, 0.0), None, None
+    """Distance of neighboring worlds [m], direction to the camera, and center and radius of what it sees."""
 
     def set_model(self, model, *args, **options):
         """Paint the magnets of a model and look at all bodies."""
@@ -78,8 +85,11 @@ class Camera(newton.viewer.ViewerNull):
         colors[model.shape_type.numpy() == int(newton.GeoType.PLANE)] = GROUND
         model.shape_color.assign(colors)
         self._renderer, self.pictures = ModelRenderer(model, SIZE, metal), []
-        if self.view:
-            self._renderer.look_at_bodies(self.view)
+        direction = {"direction": self.view} if self.view else {}
+        if self.sphere:
+            self._renderer.look_at_sphere(*self.sphere, **direction)
+        else:
+            self._renderer.look_at_bodies(**direction)
 
     def _side_by_side(self, model):
         """Return a copy of a model for drawing, whose worlds are beside each other in one world."""
@@ -127,7 +137,7 @@ def film_scene(name: str) -> None:
         warpmag.Simulation(scenes_usd.bundled()[name]).run(
             SCENES[name], output=str(run)
         )
-        warpmag.render(run, film, size=SIZE)
+        warpmag.render(run, film, size=SIZE, camera=CAMERAS.get(name))
 
 
 def film_example(name: str) -> None:
@@ -136,6 +146,7 @@ def film_example(name: str) -> None:
     options = Example.create_parser().parse_args(OPTIONS.get(name, "").split())
     camera = Camera(num_frames=options.num_frames)
     camera.pitch, camera.view = PITCHES.get(name, camera.pitch), VIEWS.get(name)
+    camera.sphere = SPHERES.get(name)
     rate = (_draw_steps if name in SLOW else _draw_frames)(
         Example(camera, options), SLOW.get(name, options.num_frames)
     )

@@ -45,7 +45,7 @@ def test_run_writes_a_stage_and_a_summary(scene, device, tmp_path, capfd):
     out = tmp_path / "new" / "out.usda"
     assert cli.main(["run", str(scene), "-o", str(out), "--frames", "3", "--device", device]) == 0
     printed = capfd.readouterr()
-    for word in ("4 moving", "RMS", "peak", "penetration", "wall time", "loading"):
+    for word in ("4 moving", "RMS", "peak", "% of the half-thickness at most", "wall time", "loading"):
         assert word in printed.out
     assert "Ti " not in printed.out  # only with --verbose
     assert "3/3" in printed.err  # the progress bar

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from warpmag import Magnetics
+from warpmag.engine.magnets.workload import moments_line
 from warpmag.engine.stepping.scene import import_scene
 
 STAGE = """#usda 1.0
@@ -101,6 +102,9 @@ def test_iron_is_what_is_drawn(tmp_path, approximation, monkeypatch):
     colliding = model.shape_flags.numpy() & newton.ShapeFlags.COLLIDE_SHAPES != 0
     assert colliding.sum() == (2 if approximation == "convexDecomposition" else 1)  # no collider more
     assert colliding[list(magnet.shapes)].all() == (approximation == "none")
+    # the path of the mesh, also where the magnet is not the collider
+    assert moments_line(magnetics) == f"{len(volumes)} in 1 body: /Tool/Blade"
+    assert magnetics.workload().bodies[0].label == "/Tool/Blade"
     assert scene.warnings == ()
 
 

@@ -228,7 +228,7 @@ def _start_warp(path: Path) -> None:
     if is_first_rank(current_ranks()):
         Waiting(f"{path.stem}: loading")
     quiet_warp()
-    watch_kernels(lambda: _status(f"{path.stem}: compiling kernels, once for this version, for a minute or two"))
+    watch_kernels(lambda: _status(f"{path.stem}: compiling kernels on first use, for up to a minute or two"))
 
 
 def _status(line: str) -> None:

@@ -177,7 +177,12 @@ class ModelRenderer:
     def look_at_bodies(self, direction: tuple[float, float, float] = _VIEW) -> None:
         """Set a camera that sees all bodies in their initial poses, in a direction from them; z is up."""
         size = _SAMPLES * self._width, _SAMPLES * self._height
-        self._view = _view_of_bodies(self._model, self._camera, *size, np.array(direction))
+        self._view = _view_of_sphere(self._camera, *size, _sphere_of_bodies(self._model), np.array(direction))
+
+    def look_at_sphere(self, center, radius: float, direction: tuple[float, float, float] = _VIEW) -> None:
+        """Set a camera that sees a sphere, in a direction from its center; z is up."""
+        size = _SAMPLES * self._width, _SAMPLES * self._height
+        self._view = _view_of_sphere(self._camera, *size, (np.array(center), radius), np.array(direction))
 
     def look_from(self, prim) -> None:
         """Set the camera of a USD prim."""
@@ -321,13 +326,13 @@ def _view_of(prim, camera: Any, width: int, height: int) -> tuple[Any, Any]:
         return rays.numpy(), wp.transform(*camera.compute_camera_transforms_usd(prim).numpy()[0])
 
 
-def _view_of_bodies(
-    model: newton.Model, camera: Any, width: int, height: int, direction: np.ndarray
+def _view_of_sphere(
+    camera: Any, width: int, height: int, sphere: tuple[np.ndarray, float], direction: np.ndarray
 ) -> tuple[Any, Any]:
-    """Return :func:`_view_of` a camera that looks at all bodies, in a direction from them."""
+    """Return :func:`_view_of` a camera that sees a sphere (center, radius [m]), in a direction from it."""
     field = min(_FIELD_OF_VIEW, 2.0 * math.atan(math.tan(0.5 * _FIELD_OF_VIEW) * height / width))
     rays = camera.compute_camera_rays_pinhole(width, height, camera_fov=field, device="cpu")
-    return rays.numpy(), _looking_at_bodies(model, field, direction)
+    return rays.numpy(), _looking_at_sphere(*sphere, field, direction)
 
 
 def _shown(model: newton.Model) -> np.ndarray:
@@ -336,8 +341,8 @@ def _shown(model: newton.Model) -> np.ndarray:
     return np.flatnonzero(shape_body >= 0) if (shape_body >= 0).any() else np.arange(model.shape_count)
 
 
-def _looking_at_bodies(model: newton.Model, field: float, direction: np.ndarray) -> wp.transform:
-    """Return a camera pose that sees all shapes of bodies, or all shapes without any, in a view of ``field`` [rad]."""
+def _sphere_of_bodies(model: newton.Model) -> tuple[np.ndarray, float]:
+    """Return center and radius [m] of a sphere that holds all shapes of bodies, or all shapes without any."""
     shape_body, poses = model.shape_body.numpy(), model.body_q.numpy()
     frames, radii = model.shape_transform.numpy(), model.shape_collision_radius.numpy()
     shown = _shown(model)
@@ -346,12 +351,16 @@ def _looking_at_bodies(model: newton.Model, field: float, direction: np.ndarray)
         origin, body = wp.vec3(*frames[shape, :3]), shape_body[shape]
         centers[row] = wp.transform_point(wp.transform(*poses[body]), origin) if body >= 0 else origin
     low, high = (sign * (sign * centers + radii[shown, None]).max(axis=0) for sign in (-1.0, 1.0))
-    center, extent = 0.5 * (low + high), 0.5 * np.linalg.norm(high - low)
+    return 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+
+
+def _looking_at_sphere(center: np.ndarray, radius: float, field: float, direction: np.ndarray) -> wp.transform:
+    """Return a camera pose that sees a sphere in a view of ``field`` [rad]."""
     back = direction / np.linalg.norm(direction)
     right = np.cross((0.0, 0.0, 1.0), back)
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(back, right), back], axis=1)  # the camera looks along its -z, y is up
-    eye = center + extent / math.sin(0.5 * field) * back
+    eye = center + radius / math.sin(0.5 * field) * back
     return wp.transform(wp.vec3(*eye), wp.quat_from_matrix(wp.mat33(*axes.ravel().tolist())))
 
 

@@ -9,6 +9,18 @@ from warpmag.errors import InputError
 
 _WILDCARDS = "*?["
 _MOST_LISTED = 3  # labels in a message
+MESH_SUFFIX = "_drawn"
+"""Suffix of the label of a mesh that is a magnet in place of its simplified collider."""
+
+
+def prim_label(shape: int, labels: Sequence[str]) -> str:
+    """Return the label of a shape, or that of its collider if the shape is a mesh with ``MESH_SUFFIX``.
+
+    The label of the collider is the path of the mesh on the stage.
+    """
+    label = labels[shape]
+    collider = label.removesuffix(MESH_SUFFIX)
+    return collider if collider != label and collider in labels else label
 
 
 def selected(name: str, wanted: int | str, labels: Sequence[str], noun: str) -> list[int]:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpmag.engine.magnets.placed_moments import PlacedMoments
+from warpmag.engine.magnets.selection import prim_label
 from warpmag.kernels.applied.near_cells import NEAR
 from warpmag.moments.part_times import part_times
 
@@ -90,7 +91,7 @@ def workload(magnetics, placed: PlacedMoments) -> Workload:
     order, labels = np.argsort(-of_bodies, kind="stable"), magnetics.model.shape_label
     newton_worlds = magnetics.worlds
     rows = (
-        (labels[magnets[k].shapes[0]], newton_worlds[worlds[k]], magnets[k].magnet.kind, counts[k], near[k])
+        (prim_label(magnets[k].shapes[0], labels), newton_worlds[worlds[k]], magnets[k].magnet.kind, counts[k], near[k])
         for k in order
     )
     bodies = tuple(
@@ -114,7 +115,7 @@ def moments_line(magnetics) -> str:
     """Return the number of moments, and the body that has most of them, in words."""
     counts = [len(magnet.lattice.volumes) for magnet in magnetics.magnets]
     largest = int(np.argmax(counts))
-    label = magnetics.model.shape_label[magnetics.magnets[largest].shapes[0]]
+    label = prim_label(magnetics.magnets[largest].shapes[0], magnetics.model.shape_label)
     if len(counts) == 1:
         return f"{counts[0]:,} in 1 body: {label}"
     return f"{sum(counts):,} in {len(counts):,} bodies, at most {counts[largest]:,} in one body: {label}"

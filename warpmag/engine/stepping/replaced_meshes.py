@@ -7,6 +7,7 @@ import newton
 import numpy as np
 
 from warpmag.engine.magnets.sampling import solid_of
+from warpmag.engine.magnets.selection import MESH_SUFFIX
 from warpmag.errors import InputError
 
 _REPLACING = ("coacd", "vhacd", "convex_hull", "bounding_box", "bounding_sphere")
@@ -80,5 +81,5 @@ class StageBuilder(newton.ModelBuilder):
         config = newton.ModelBuilder.ShapeConfig(
             density=0.0, has_shape_collision=False, has_particle_collision=False, is_visible=False
         )
-        pose, label = {"xform": original.frame, "scale": original.scale}, f"{self.shape_label[shape]}_drawn"
+        pose, label = {"xform": original.frame, "scale": original.scale}, f"{self.shape_label[shape]}{MESH_SUFFIX}"
         return self.add_shape_mesh(self.shape_body[shape], mesh=original.mesh, cfg=config, label=label, **pose)

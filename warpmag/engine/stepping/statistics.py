@@ -34,9 +34,9 @@ class Statistics:
         field_error: Relative error of the last field by the fast multipole method at 256 random magnets, compared with
             sums over all pairs; 0 without that method.
         peak_speed: Highest speed of a body [m/s].
-        overlap: Deepest penetration over the thickness of the thinner body; the thickness of a ball is its radius.
+        overlap: Deepest penetration over the half-thickness of the thinner body; for a ball that is its radius.
         depth: Deepest penetration [m].
-        final_overlap: Deepest penetration at the end over the thickness of the thinner body.
+        final_overlap: Deepest penetration at the end over the half-thickness of the thinner body.
         rms_speed: Root mean square speed of the magnets at the end [m/s].
         held: Bodies that touch a permanent or fixed magnet at the end, and bodies off the ground that touch it through
             others off the ground.
@@ -44,7 +44,7 @@ class Statistics:
         held_median_speed: Median speed of held bodies [m/s]; below the RMS if single bodies slide without friction.
         farthest: Largest distance of a magnet from the mean initial position, in any frame [m].
         overlapping: Number of overlapping contacts at the start.
-        coarseness: Spacing of single-precision positions at the start over the thickness of the thinnest body.
+        coarseness: Spacing of single-precision positions at the start over the half-thickness of the thinnest body.
         wall_seconds: Duration of the run [s]; in ``warpmag run`` without the compilation of kernels.
     """
 
@@ -125,13 +125,13 @@ class Statistics:
             plural = self.overlapping > 1
             lines.append(f"{self.overlapping} pair{'s' * plural} of bodies overlap{'s' * (not plural)} at the start")
         if self.coarseness > _COARSE:
-            spacing = f"{100.0 * self.coarseness:.2g} % of a radius"
+            spacing = f"{100.0 * self.coarseness:.2g} % of a half-thickness"
             lines.append(f"bodies are far from the origin: positions in single precision are {spacing} apart")
         if self.unconverged:
             solves = f"{self.unconverged} induction solve{'s' * (self.unconverged > 1)}"
             lines.append(f"{solves} did not converge, in {self.substeps} substeps")
         if self.final_overlap > _DEEP:
-            lines.append(f"bodies overlap by {100.0 * self.final_overlap:.0f} % of their radius at the end")
+            lines.append(f"bodies overlap by {100.0 * self.final_overlap:.0f} % of their half-thickness at the end")
         if self.capped:
             lines.append(f"bodies were too fast for the shortest substep in {self.capped} of {self.steps} steps")
         return lines
@@ -150,7 +150,7 @@ class Statistics:
             f"steps          {self.steps}",
             *(self._details() if details else ()),
             f"speed          RMS {100.0 * self.rms_speed:.2f} cm/s at the end, peak {self.peak_speed:.2f} m/s",
-            f"penetration    {100.0 * self.overlap:.2f} % of the radius at most ({1e3 * self.depth:.4f} mm), "
+            f"penetration    {100.0 * self.overlap:.2f} % of the half-thickness at most ({1e3 * self.depth:.4f} mm), "
             f"{100.0 * self.final_overlap:.2f} % at the end",
             f"farthest       {self.farthest:.3f} m from the mean initial position",
         ]
