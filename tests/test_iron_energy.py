@@ -35,6 +35,7 @@ class Path:
 
     drop: float
     work: float
+    rounding: float  # of the energy in float32, over the scale
 
 
 class MovedBody:
@@ -50,10 +51,10 @@ class MovedBody:
 
     def along(self, path) -> Path:
         """Path of twists (displacement [m] and rotation vector about the center of mass), from -path to path."""
-        drop = self._put(-path)[0] - self._put(path)[0]
+        begin, end = self._put(-path)[0], self._put(path)[0]
         wrenches = np.array([self._put(node * path)[1] for node in NODES])
         scale = WEIGHTS @ np.linalg.norm(wrenches[:, :3], axis=1) * np.linalg.norm(path * [1, 1, 1, *[self.reach] * 3])
-        return Path(drop / scale, WEIGHTS @ wrenches @ path / scale)
+        return Path((begin - end) / scale, WEIGHTS @ wrenches @ path / scale, 6e-8 * abs(end) / scale)
 
     def _put(self, twist):
         """Energy [J] and wrench on the body, displaced and turned."""
@@ -72,15 +73,14 @@ class MovedBody:
 def test_work_of_forces_and_torques_is_the_drop_of_the_energy(name, device):
     """Five Gauss points are exact for a force of degree nine over a quarter of the gap on both sides.
 
-    Rounding of the energy in float32, 1e-7, is 1e-5 of the work. That of positions, 2e-9 m, is up to 1e-4 of a turn by
-    a fifth of the gap, and 5e-4 of half that turn.
+    Rounding of positions, 2e-9 m, is up to 1e-4 of the work. Sums over the cells round the energy by up to ten units.
     Works are relative to the work of the force at the end of the body.
     """
     body = MovedBody(name, device)
     shift = 0.25 * body.gap * np.array([0.48, 0.36, 0.8, 0.0, 0.0, 0.0])  # oblique, so that no symmetry helps
     turn = 0.2 * body.gap / body.reach * np.array([0.0, 0.0, 0.0, 0.48, 0.6, 0.64])
     for path in (body.along(shift), body.along(turn)):
-        assert path.work == pytest.approx(path.drop, abs=3e-4)
+        assert path.work == pytest.approx(path.drop, abs=3e-4 + 10.0 * path.rounding)
 
 
 HALF_SIDES = np.array([0.015, 0.003, 0.003])  # of bars [m]
