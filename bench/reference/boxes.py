@@ -81,7 +81,8 @@ def blended_tensor(source, target, fine: float) -> np.ndarray:
 def fine_share(half, shares: tuple[tuple[float, float], ...]) -> float:
     """Weight of the fine points of a box."""
     least, middle, _ = np.sort(half)
-    return float(np.interp(least / middle, *zip(*shares, strict=True)))
+    ratios, weights = zip(*shares, strict=True)
+    return float(np.interp(least / middle, ratios, weights))
 
 
 def pair_correction(a, b, windows: Windows) -> np.ndarray:

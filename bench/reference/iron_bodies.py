@@ -117,6 +117,9 @@ def _axial_setups() -> dict[str, Setup]:
     for count in (1, 2, 5):
         discs = tuple(_cylinder(40.0, 2.0, 2.02 * k) for k in range(count))
         setups[f"{count} discs, gap 0.02"] = Setup(discs, along)
+    for count, diameter, height, gap in ((2, 30.0, 3.0, 0.05), (2, 50.0, 5.0, 0.1), (3, 25.0, 1.0, 0.01)):
+        discs = tuple(_cylinder(diameter, height, (height + gap) * k) for k in range(count))
+        setups[f"{count} discs of {diameter:g} x {height:g}, gap {gap:g}"] = Setup(discs, along)
     for thickness in (1.0, 3.0, 10.0):
         for gap in (0.02, 1.0, 5.0, 20.0):
             place = f"plate {thickness:g}, gap {gap:g}"

@@ -176,7 +176,8 @@ def _volume_factors(half_sides) -> np.ndarray:
 def _fine_share(half_sides) -> float:
     """Return the weight of the fine points of a body's cells; ``half_sides`` have the shape [cells, 3]."""
     least, middle, _ = np.sort(half_sides[half_sides.prod(axis=1).argmax()])
-    return float(np.interp(least / middle, *zip(*FINE_SHARES, strict=True)))
+    ratios, weights = zip(*FINE_SHARES, strict=True)
+    return float(np.interp(least / middle, ratios, weights))
 
 
 def _balls_among_cells(balls, radii, worlds, group, half) -> np.ndarray:
