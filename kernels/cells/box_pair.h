@@ -24,10 +24,8 @@ constexpr Real SHORTER = Real(0.999); // ratio of longest sides from which a box
 // differences. ``fine_share`` is the weight of 4 × 4 × 2 points where all boxes of the pair are close.
 struct Boxes {
     Vector center, half;
-    Number q[4], volume, size, radius;
-    Mask ball, linear;
-    Number fine_share;
-    Mask inducible;
+    Number q[4], volume, size, radius, fine_share;
+    Mask ball, linear, inducible;
 };
 
 // Pose of box j relative to box i: separation, and rotation from the frame of j to that of i.

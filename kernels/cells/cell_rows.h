@@ -212,9 +212,9 @@ template <class Pairs> struct Rows {
                 kind.x,
                 sides.w,
                 place.w,
+                kind.z - linear,
                 kind.y > Real(0),
                 linear > zero,
-                kind.z - linear,
                 kind.w > Real(0)};
     }
     // Slot of each pair in the row of the other cell, or who owns it.
