@@ -120,7 +120,7 @@ def test_pages_build_without_a_warning(tmp_path):
     build = [sys.executable, "-m", "sphinx", "-q", "-n", "-W", "--keep-going", DOCS, tmp_path]
     built = subprocess.run(build, capture_output=True, text=True, timeout=600)
     assert built.returncode == 0, built.stderr
-    page = (tmp_path / "usd.html").read_text(encoding="utf-8")
+    page = (tmp_path / "usd.html").read_text(encoding="utf-8").replace("<wbr>", "")  # possible breaks in names
     layer = Sdf.Layer.FindOrOpen(str(ROOT / "warpmag" / "usd" / "schema" / "generatedSchema.usda"))
     attributes = {entry.name for prim in layer.rootPrims for entry in prim.properties}
     assert "warpmag:kind" in attributes
