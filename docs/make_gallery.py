@@ -193,8 +193,9 @@ def page() -> str:
     """Return the page of the gallery."""
     head = (
         "# Gallery\n\n"
-        "`docs/make_gallery.py` runs these scenes and examples and draws films by ray tracing. For two scenes this page\n"
-        "shows stills [drawn by Blender](pictures.md) instead of films. [Scenes of many balls](howto/many_balls.md) describes the scene `million`."
+        "`docs/make_gallery.py` runs these scenes and examples and draws films by ray tracing. For two scenes this\n"
+        "page shows stills [drawn by Blender](pictures.md) instead of films. [Scenes of many\n"
+        "balls](howto/many_balls.md) describes the scene `million`."
         "\n\n"
     )
     entries = [(f"warpmag run {name}", scene_line(name), name) for name in SCENES]
