@@ -99,5 +99,5 @@ def pair_corrections(bodies, couplings, poses):
     ]
     labels = np.repeat(np.arange(len(bodies)), [len(body.volumes) for body in bodies])
     overlap = cell_pairs.OVERLAP_DEMAGNETIZATION, cell_pairs.OVERLAP
-    windows = boxes.Windows(cell_pairs.WINDOW, cell_pairs.CLOSE, cell_pairs.FINE, cell_pairs.FINE_SHARES)
+    windows = boxes.Windows(cell_pairs.WINDOW, cell_pairs.CLOSE, cell_pairs.FINE, cell_pairs.FLAT)
     return boxes.body_corrections(cells, labels, windows, *overlap)

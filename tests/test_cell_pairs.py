@@ -108,22 +108,6 @@ def test_fine_points_of_touching_flat_boxes_are_accurate():
         assert error < 1.5e-3 / (8.0 * half.prod())
 
 
-@pytest.mark.parametrize("ratio", [0.68, 0.85])
-def test_points_of_touching_boxes_that_are_slightly_flat_are_accurate(ratio):
-    """Fields and derivatives of the factor of touching boxes, compared with 32³ points: 2³ points leave 2 to 5 %."""
-    half, step = np.array([0.5 / ratio, 0.5 / ratio, 0.5]), 1e-3
-    nodes = (np.arange(32) + 0.5) / 16.0 - 1.0
-    points = np.array(list(itertools.product(nodes, repeat=3))) * half
-    box, share = (np.zeros(3), np.eye(3), half), boxes.fine_share(half, cell_pairs.FINE_SHARES)
-    exact, few = [], []
-    for gap in (0.02 - step, 0.02, 0.02 + step):
-        shift = np.array([0.0, 0.0, 1.0 + gap])
-        exact.append(boxes.field_tensor(points + shift, half).mean(axis=0)[2, 2])
-        few.append(boxes.blended_tensor(box, (shift, np.eye(3), half), share)[2, 2] * 8.0 * half.prod())
-    assert few[1] == pytest.approx(exact[1], rel=0.01)
-    assert few[2] - few[0] == pytest.approx(exact[2] - exact[0], rel=0.015)
-
-
 def test_fields_of_halves_are_means_over_the_halves(device):
     """Half the differences of fields of uniform boxes between the halves of linear cells, compared with 12³ points.
 

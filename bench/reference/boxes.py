@@ -18,7 +18,7 @@ class Windows(NamedTuple):
     all: tuple[float, float]  # of all boxes
     close: tuple[float, float]  # of boxes that are integrated over
     fine: tuple[float, float]  # of flat boxes that have fine points, in means of longest sides
-    fine_shares: tuple[tuple[float, float], ...]  # weight of fine points by the ratio of the two shortest sides
+    flat: float  # ratio of the two shortest sides of flat boxes
 
 
 def field_tensor(r: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -78,11 +78,10 @@ def blended_tensor(source, target, fine: float) -> np.ndarray:
     return turn @ (fine * mean_tensor(*points, fine=True) + (1.0 - fine) * mean_tensor(*points)) @ turn.T
 
 
-def fine_share(half, shares: tuple[tuple[float, float], ...]) -> float:
-    """Weight of the fine points of a box."""
+def is_flat(half, ratio: float) -> bool:
+    """Return True if the shortest side of a box is shorter than the next one times ``ratio``."""
     least, middle, _ = np.sort(half)
-    ratios, weights = zip(*shares, strict=True)
-    return float(np.interp(least / middle, ratios, weights))
+    return bool(least < ratio * middle)
 
 
 def pair_correction(a, b, windows: Windows) -> np.ndarray:
@@ -102,8 +101,7 @@ def pair_correction(a, b, windows: Windows) -> np.ndarray:
 
     source, target = (b, a) if half.prod() <= other_half.prod() * 1.0005 else (a, b)
     sides = d / (half.max() + other_half.max())
-    fine = fine_share(target[2], windows.fine_shares) * fade(sides, windows.fine)
-    of_larger = blended_tensor(source, target, fine)
+    of_larger = blended_tensor(source, target, is_flat(target[2], windows.flat) * fade(sides, windows.fine))
     spread = turn @ np.diag(half**2 / 3.0) @ turn.T + other_turn @ np.diag(other_half**2 / 3.0) @ other_turn.T
     g1, g2, _ = oracle.radial_factors(np.array([d]), radii[0], radii[1])
     ball = (g1[0] * np.eye(3) + g2[0] * np.outer(r, r)) / (4.0 * np.pi)

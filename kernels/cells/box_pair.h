@@ -21,11 +21,11 @@ constexpr Real SHORTER = Real(0.999); // ratio of longest sides from which a box
 
 // Boxes of cells: center, half sides, rotation to the world as quaternion, volume, the size that scales the window, and
 // the radius of the ball of the same volume. Balls have half sides for the windows only. ``linear`` boxes have
-// differences. ``fine_share`` is the weight of 4 × 4 × 2 points where all boxes of the pair are close.
+// differences; ``flat`` ones are of bodies of flat cells.
 struct Boxes {
     Vector center, half;
-    Number q[4], volume, size, radius, fine_share;
-    Mask ball, linear, inducible;
+    Number q[4], volume, size, radius;
+    Mask ball, linear, flat, inducible;
 };
 
 // Pose of box j relative to box i: separation, and rotation from the frame of j to that of i.
@@ -75,10 +75,10 @@ CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, cons
     const Number own_longest = longest_of(own), other_longest = longest_of(other);
     const Mask own_shorter = own_longest < SHORTER * other_longest, alike = own_longest * SHORTER <= other_longest;
     const Mask own_points = own_shorter | (own_first & alike);
-    const Number fine_share = own_points ? own.fine_share : other.fine_share;
+    const Mask flat = own_points ? own.flat : other.flat;
     const Number per_side = 1 / (unit * (own_longest + other_longest)); // from units of the pair to mean longest sides
-    Window fine = window_between(per_side * d, FINE_BEGIN, FINE_END, listed);
-    fine = {fine_share * fine.value, fine_share * per_side * fine.slope};
+    Window fine = window_between(per_side * d, FINE_BEGIN, FINE_END, listed & flat);
+    fine.slope *= per_side;
     return {unit * own.half,
             unit * other.half,
             r,

@@ -46,9 +46,8 @@ FINE = 1.2, 1.6
 factor between touching boxes twice as wide as high is 7 % too large with 2³ points. Cells beside a touching one are
 within 1.2 sides. The force between two discs of 40:2 mm has an error of 3 %. With 0.9 and 1.2 it is 9 %, with 2.1 and
 2.6 it is 4 %. A pair with fine points takes four times as long as another close one."""
-FINE_SHARES = (0.55, 1.0), (0.68, 0.7), (0.85, 0.4), (0.93, 0.0)
-"""Weight of the 4 × 4 × 2 points by the ratio of the two shortest sides of whole cells. Between touching boxes a factor
-and its derivative by the gap are too large with 2³ points, and too small with finer ones."""
+FLAT = 0.57
+"""Ratio of the shortest side to the next one below which whole cells of a body are flat."""
 OVERLAP_DEMAGNETIZATION = 0.45
 """Demagnetizing factor added to a cell inside another body. Quadrature over intersecting boxes leaves eigenvalues of
 -0.13."""
@@ -100,7 +99,7 @@ def cell_pairs_type(dtype):
         half: wp.array2d[dtype]  # half sides of the boxes in the frame of the body's grid, and sizes [m], shape [4, n]
         grid: wp.array[quaternion]  # from the frame of each body's grid to that of the body, shape [b]
         linear: wp.array[int]  # 1 for bodies of linear cells, 0 for balls, shape [b + 1]
-        fine_share: wp.array[dtype]  # weight of 4 × 4 × 2 points of each body's cells, 0 for balls, shape [b + 1]
+        flat: wp.array[int]  # 1 for bodies of flat cells, 0 for balls, shape [b + 1]
         inducible: wp.array[int]  # 1 for inducible moments, shape [n]
         movable: wp.array[int]  # 1 where the force is evaluated, shape [n]
         rotatable: wp.array[int]  # 1 where the torque is evaluated, too, shape [n]
@@ -173,11 +172,10 @@ def _volume_factors(half_sides) -> np.ndarray:
     return (volumes / volumes.max()) ** 0.2
 
 
-def _fine_share(half_sides) -> float:
-    """Return the weight of the fine points of a body's cells; ``half_sides`` have the shape [cells, 3]."""
+def _has_flat_cells(half_sides) -> bool:
+    """Return True if whole cells of a body are flat; ``half_sides`` have the shape [cells, 3]."""
     least, middle, _ = np.sort(half_sides[half_sides.prod(axis=1).argmax()])
-    ratios, weights = zip(*FINE_SHARES, strict=True)
-    return float(np.interp(least / middle, ratios, weights))
+    return bool(least < FLAT * middle)
 
 
 def _balls_among_cells(balls, radii, worlds, group, half) -> np.ndarray:
@@ -284,7 +282,7 @@ class CellPairs:
         quaternion = wp.types.quaternion(dtype)
         a.group, a.body, a.half, a.movable = put(group), put(body), put(half, dtype), put(layout.movable)
         a.rotatable, a.inducible = rotatable, put(~layout.permanent)
-        a.fine_share = put([*(_fine_share(coupling.half_sides) for _, coupling in bodies), 0.0], dtype)
+        a.flat = put([*(_has_flat_cells(coupling.half_sides) for _, coupling in bodies), False])
         a.linear = put([*(coupling.slopes is not None for _, coupling in bodies), False])
         a.grid, a.rotation = put([coupling.grid_rotation for _, coupling in bodies], quaternion), cells.rotations
         a.packed, a.h, a.forces, a.torques = packed.packed, h, forces, torques

@@ -30,7 +30,7 @@ template <class Pairs> CUDA_CALLABLE inline void locate(const Pairs& a, int i) {
     for (int k = 0; k < 4; ++k) line[k] = row[k * pitch], line[4 + k] = half[k * cells], turn[k] = k == 3;
     if (!is_ball) put_product(a.rotation.data[body], a.grid.data[body], turn);
     line[12] = is_ball ? BALL * line[3] * line[3] * line[3] : 8 * line[4] * line[5] * line[6];
-    line[13] = is_ball, line[14] = 2 * a.linear.data[body] + a.fine_share.data[body], line[15] = a.inducible.data[i];
+    line[13] = is_ball, line[14] = a.linear.data[body] + 2 * a.flat.data[body], line[15] = a.inducible.data[i];
     bool same = true;
     for (int k = 0; k < LINE; ++k) same = same && stored[k] == line[k], stored[k] = line[k];
     if (!same) raise_flag(*a.displaced.data);
@@ -51,9 +51,6 @@ CUDA_CALLABLE inline int increment(int* count) {
 // True if cell i owns its pair with cell j: half the pairs of a cell on a lattice.
 CUDA_CALLABLE inline bool owns(int i, int j) { return (i + j) % 2 ? i < j : i > j; }
 
-// Share of fine points from a line of ``box``.
-CUDA_CALLABLE inline Real fine_share(const Real* line) { return line[14] < 2 ? line[14] : line[14] - 2; }
-
 // Kinds of candidates by distance. Differences act between the first three, the others are too far for their longest
 // sides. The first ones have fine points.
 enum Distance { FINE_NOW, CLOSE_NOW, MAY_BE_CLOSE, CLOSE_AND_FLAT, NEAR_NOW, MAY_BE_NEAR, DISTANCES };
@@ -70,7 +67,7 @@ template <class Pairs> CUDA_CALLABLE inline int distance_of(const Pairs& a, int 
     const Real d2 = r[0] * r[0] + r[1] * r[1] + r[2] * r[2];
     const Real size = (own[7] + other[7]) / 2, longest = longest_half(own) + longest_half(other);
     auto within = [=](Real reach) { return d2 < reach * reach; };
-    const bool close = within(CLOSE_END * size), flat = fine_share(own) > 0 || fine_share(other) > 0;
+    const bool close = within(CLOSE_END * size), flat = own[14] >= 2 || other[14] >= 2;
     const bool fine = flat && within(FINE_END * longest);
     if (within((CLOSE_END + MARGIN) * longest)) return fine ? FINE_NOW : close ? CLOSE_NOW : MAY_BE_CLOSE;
     return close ? CLOSE_AND_FLAT : within(WINDOW_END * size) ? NEAR_NOW : MAY_BE_NEAR;
@@ -205,16 +202,15 @@ template <class Pairs> struct Rows {
     CUDA_CALLABLE Boxes boxes(const Cells& c) const {
         const Four place = four_at(a.box.data, 0, c.at), sides = four_at(a.box.data, 1, c.at),
                    turn = four_at(a.box.data, 2, c.at), kind = four_at(a.box.data, 3, c.at);
-        const Number zero = kind.z * Real(0), linear = kind.z >= Real(2) ? zero + 2 : zero;
         return {{place.x, place.y, place.z},
                 {sides.x, sides.y, sides.z},
                 {turn.x, turn.y, turn.z, turn.w},
                 kind.x,
                 sides.w,
                 place.w,
-                kind.z - linear,
                 kind.y > Real(0),
-                linear > zero,
+                (kind.z == Real(1)) | (kind.z == Real(3)),
+                kind.z >= Real(2),
                 kind.w > Real(0)};
     }
     // Slot of each pair in the row of the other cell, or who owns it.
