@@ -52,23 +52,6 @@ def test_operator_of_a_compact_body_of_the_default_number_of_cells_is_positive(s
     assert values[0] > 5e-4
 
 
-def test_near_fields_belong_to_the_sampled_cells():
-    """A factor of the volumes makes the total exact. It changes moments, whose far fields are those of dipoles.
-
-    Fields of near moments stay those of cells of the sampled size, so near and far cells have the same charges.
-    """
-    body = lattice.fill(lattice.cylinder(1.0, 1.0), 0.5, together=True)
-    scaled = lattice.Lattice(body.positions, 1.05 * body.volumes, body.owners, body.pieces)
-    near = []
-    for part in (body, scaled):
-        coupling = demagnetization.coupling(part, part.radii)
-        row, n = np.repeat(np.arange(len(part.volumes)), np.diff(coupling.start)), len(part.volumes)
-        law = demagnetization.pair_law_tensors(part.positions, part.radii)
-        law[np.arange(n), np.arange(n), :3] = -1.0 / (3.0 * part.volumes[:, None])  # the ball's own field
-        near.append(coupling.tensor + law[row, coupling.other])
-    np.testing.assert_allclose(near[1], near[0], atol=1e-12 * np.abs(near[0]).max())
-
-
 @pytest.mark.parametrize("apart", [0.0, 0.004, 0.009, 0.01])
 def test_bodies_that_touch_or_intersect_have_one_solution(device, apart):
     """Two cubes of 10 mm and infinite permeability, also coincident, from different starts."""

@@ -92,7 +92,7 @@ class Coupling:
     common: np.ndarray  # C [1/m³] (``uniform_response.py``), shape [3, 3]
     positions: np.ndarray  # positions of the moments [m], shape [n, 3]
     radii: np.ndarray  # radii of the moments' balls [m], shape [n]
-    half_sides: np.ndarray  # boxes with the volumes and second moments of cells, frame of the grid [m], shape [n, 3]
+    half_sides: np.ndarray  # boxes with the volumes and second moments of the cells, frame of the grid [m], [n, 3]
     outer_faces: np.ndarray  # True for the faces −x, +x, −y, ... of whole cells on the body's surface, shape [n, 6]
     cell_sides: np.ndarray  # sides of a whole cell [m], frame of the grid, shape [3]
     grid_rotation: np.ndarray  # from the frame of the grid to that of the body (x, y, z, w), shape [4]
@@ -260,26 +260,24 @@ def coupling(lattice: Lattice, radii: np.ndarray) -> Coupling:
     for part in lattice.pieces:
         (i, j), exact = _part_tensors(part, lattice)
         entries.append(np.stack([i, j]))
+        exact = -exact / np.sqrt(volumes[i] * volumes[j])[:, None]
         tensors.append(exact - _pair_law(x[i] - x[j], radii[i], radii[j], i == j))
     (i, j), tensor = np.concatenate(entries, axis=1), np.concatenate(tensors)
     order = np.lexsort((j, i))
     start = np.searchsorted(i[order], np.arange(len(volumes) + 1))
     (part,) = lattice.pieces  # the shapes of an inducible body share a grid
     return Coupling(
-        start, j[order], tensor[order], np.zeros((3, 3)), x, radii, _boxes(part, len(volumes)),
+        start, j[order], tensor[order], np.zeros((3, 3)), x, radii, _boxes(part, lattice.volumes),
         _outer_faces(part, len(volumes)), part.sides, quaternion_of(part.rotation), None,
     )  # fmt: skip
 
 
-def _boxes(part: Pieces, count: int) -> np.ndarray:
-    """Return the half sides of the cells' boxes [m], shape [count, 3].
-
-    Boxes have the sampled volumes of the cells, like their tensors, and the ratios of their second moments. With the
-    second moments themselves, solves of cut letters that touch would take three times as many evaluations.
-    """
-    filled = np.bincount(part.moment, part.share * part.filled.mean(axis=(1, 2, 3))[part.piece], count)
-    half = np.sqrt(np.einsum("nkk->nk", _spreads(part, 0, filled)))
-    return half * np.cbrt(part.sides.prod() * filled / (8.0 * half.prod(axis=1)))[:, None]
+def _boxes(part: Pieces, volumes: np.ndarray) -> np.ndarray:
+    """Return the half sides of the cells' boxes [m], shape [n, 3]."""
+    filled = np.bincount(part.moment, part.share * part.filled.mean(axis=(1, 2, 3))[part.piece])
+    squares = np.einsum("nkk->nk", _spreads(part, 0, filled))
+    half = np.sqrt(3.0 * squares)
+    return half * np.cbrt(volumes / (8.0 * half.prod(axis=1)))[:, None]
 
 
 def _outer_faces(part: Pieces, count: int) -> np.ndarray:
@@ -306,12 +304,7 @@ def _pair_law(r, a, b, same):
 
 
 def _part_tensors(part: Pieces, lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs of near moments, shape [2, pairs], and the field of one averaged over the other [1/m³], [pairs, 6].
-
-    Moments are spread over volumes of test points. A factor that makes the body's volume exact is left out. With it
-    near cells would have more or less charge than distant ones, like gaps between cells: letters in contact attracted
-    each other 9 % less.
-    """
+    """Return pairs of near moments, shape [2, pairs], and N_ij √(V_i V_j) over a cell's volume, shape [pairs, 6]."""
     first, count = int(part.moment.min()), len(np.unique(part.moment))
     local = (lattice.positions[first : first + count] - part.position) @ part.rotation
     reach = _reach(local, float(part.sides.max()))
@@ -333,9 +326,7 @@ def _part_tensors(part: Pieces, lattice: Lattice) -> tuple[np.ndarray, np.ndarra
     sums = np.stack([np.bincount(pair, weight * values[:, c], len(i)) for c in range(6)], axis=1)
     sums /= np.sqrt(volume[i] * volume[j])[:, None]
     own, spreads = i == j, _second_moments(part, first, volume)
-    volume = part.sides.prod() * volume
-    sums[own] += _far_corrections(local, volume, spreads, reach)[i[own]]
-    sums /= -np.sqrt(volume[i] * volume[j])[:, None]
+    sums[own] += _far_corrections(local, part.sides.prod() * volume, spreads, reach)[i[own]]
     distinct = i != j
     pairs = np.concatenate([np.stack([i, j]), np.stack([j[distinct], i[distinct]])], axis=1) + first
     return pairs, rotated(np.concatenate([sums, sums[distinct]]), part.rotation)
