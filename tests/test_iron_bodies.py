@@ -75,6 +75,17 @@ def test_lines_compare_a_model_with_the_table(device, monkeypatch, capsys):
     assert line["force_sum"] < 1e-5
 
 
+def test_letters_whose_faces_are_not_between_cells(device):
+    """17 cells along 14 mm: faces at 5 and 9 mm are inside cells.
+
+    With 4 test points across a cell and one factor for the volumes of all cells the error would be 13 %.
+    """
+    name = "letters T and L, gap 0.2"
+    line = iron.errors(SETUPS[name], load()[name], cells=1000, device=device)
+    assert line["converged"]
+    assert line["force_error"] < 0.05
+
+
 def test_cylinders_side_by_side_that_nearly_touch(device):
     """Cells of 2 mm leave 6 % at a gap of 0.2 mm; with four times the energy of the curl of M it would be 13 %."""
     name = "cylinders side by side, gap 0.2"

@@ -33,9 +33,9 @@ class Filled:
 
     index: np.ndarray  # index in the grid of each cell that the shape reaches into, shape [m, 3]
     shares: np.ndarray  # filled share of each subcell, shape [m, a, b, c]
-    weights: np.ndarray  # number of test points of each cell in the filled part, shape [m]
+    weights: np.ndarray  # number of test points of each cell in the filled part, shape [m]; fractions are possible
     sums: np.ndarray  # sum of the positions of these points [m], frame of the grid, shape [m, 3]
-    point_count: int  # number of test points in the shape, including overlap with earlier shapes
+    point_count: float  # number of test points in the shape, including overlap with earlier shapes
 
 
 @dataclass(frozen=True)
@@ -59,16 +59,19 @@ class CellGrid:
         if (part.upper - part.lower < 2.0 * pitch).any():
             return self._filled_by_thin_shape(part, others, pitch)
         in_own_frame = not part.position.any() and (part.rotation == np.eye(3)).all()
-        index, hits, point_count = self._hits_along_axes(part, others) if in_own_frame else self._hits(part, others)
-        weights, shares = np.count_nonzero(hits, axis=1).astype(float), hits.astype(float)
+        index, inside, hits = self._hits_along_axes(part, others) if in_own_frame else self._hits(part, others)
+        factors = _volume_factors(inside / hits.shape[1], part.volume / self.sides.prod())
+        used = hits.any(axis=1)
+        index, shares = index[used], factors[used, None] * hits[used]
+        weights = shares.sum(axis=1)
         sums = weights[:, None] * (self.lower + (index + 0.5) * self.sides) + shares @ self._offsets()
-        return Filled(index, shares.reshape(-1, *self.splits), weights, sums, point_count)
+        return Filled(index, shares.reshape(-1, *self.splits), weights, sums, float(inside @ factors))
 
     def _offsets(self) -> np.ndarray:
         """Return the test points of a cell relative to its center [m], shape [points, 3]."""
         return ((grid(self.splits) + 0.5) / self.splits - 0.5) * self.sides
 
-    def _hits_along_axes(self, part: Solid, others: list[Solid]) -> tuple[np.ndarray, np.ndarray, int]:
+    def _hits_along_axes(self, part: Solid, others: list[Solid]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return :meth:`_hits` of a shape that has the frame of the grid, from test points in a grid along its axes."""
         first = np.maximum(np.floor((part.lower - self.lower) / self.sides).astype(int) - 1, 0)
         last = np.minimum(np.ceil((part.upper - self.lower) / self.sides).astype(int) + 1, self.counts)
@@ -76,22 +79,22 @@ class CellGrid:
         deep, rows, columns = size * (last - first)[2], *(last - first)[:2]
         high = min(rows, max(1, _CHUNK // (columns * deep)))
         wide = columns if high > 1 else min(columns, max(1, _CHUNK // deep))  # blocks in the order of the cells
-        index, hits, point_count = [np.empty((0, 3), int)], [np.empty((0, size), bool)], 0
+        index, inside, hits = [np.empty((0, 3), int)], [np.empty(0, int)], [np.empty((0, size), bool)]
         for i, j in ((i, j) for i in range(first[0], last[0], high) for j in range(first[1], last[1], wide)):
             begin = np.array([i, j, first[2]])
             end = np.minimum([i + high, j + wide, last[2]], last)
             x, y, z = (self._test_coordinates(axis, begin[axis], end[axis]) for axis in range(3))
             free = part.contains_grid(x, y, z)
-            point_count += int(np.count_nonzero(free))
+            cells = np.stack([end - begin, self.splits], axis=1).reshape(-1)
+            count = free.reshape(cells).sum(axis=(1, 3, 5)).reshape(-1)
             for other in others:
                 a, b, c = np.nonzero(free)
                 free[a, b, c] = ~other.contains(np.stack([x[a], y[b], z[c]], axis=1))
-            cells = np.stack([end - begin, self.splits], axis=1).reshape(-1)
-            block = free.reshape(cells).transpose(0, 2, 4, 1, 3, 5).reshape(-1, size)
-            used = np.flatnonzero(block.any(axis=1))
+            used = np.flatnonzero(count)
             index.append(np.stack(np.unravel_index(used, end - begin), axis=1) + begin)
-            hits.append(block[used])
-        return np.concatenate(index), np.concatenate(hits), point_count
+            inside.append(count[used])
+            hits.append(free.reshape(cells).transpose(0, 2, 4, 1, 3, 5).reshape(-1, size)[used])
+        return np.concatenate(index), np.concatenate(inside), np.concatenate(hits)
 
     def _test_coordinates(self, axis: int, begin: int, end: int) -> np.ndarray:
         """Return the coordinates [m] of the test points of the cells from ``begin`` to ``end`` along an axis."""
@@ -99,23 +102,22 @@ class CellGrid:
         centers = self.lower[axis] + (np.arange(begin, end) + 0.5) * side
         return (centers[:, None] + ((np.arange(split) + 0.5) / split - 0.5) * side).reshape(-1)
 
-    def _hits(self, part: Solid, others: list[Solid]) -> tuple[np.ndarray, np.ndarray, int]:
-        """Return the cells with a test point in a shape outside ``others``, shape [m, 3], and these points.
+    def _hits(self, part: Solid, others: list[Solid]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the cells with test points in a shape, shape [m, 3], and the number of these points, shape [m].
 
-        The second value is True for these points, shape [m, points of a cell]. The third value is the number of points
-        in the shape, including overlap.
+        The third value is True for those of them outside ``others``, shape [m, points of a cell].
         """
         index, offsets = self._cells_near(part), self._offsets()
         cells = self.lower + (index + 0.5) * self.sides
-        hits, point_count = np.empty((len(cells), len(offsets)), bool), 0
+        inside, hits = np.empty(len(cells), int), np.empty((len(cells), len(offsets)), bool)
         step = max(1, _CHUNK // len(offsets))
         for start in range(0, len(cells), step):
             chunk = cells[start : start + step]
-            inside, free = _inside(part, others, (chunk[:, None, :] + offsets).reshape(-1, 3))
-            point_count += inside
+            in_part, free = _inside(part, others, (chunk[:, None, :] + offsets).reshape(-1, 3))
+            inside[start : start + step] = np.count_nonzero(in_part.reshape(len(chunk), -1), axis=1)
             hits[start : start + step] = free.reshape(len(chunk), -1)
-        used = hits.any(axis=1)
-        return index[used], hits[used], point_count
+        used = inside > 0
+        return index[used], inside[used], hits[used]
 
     def _cells_near(self, part: Solid) -> np.ndarray:
         """Return the sorted indices of the cells that the rotated bounding box of a shape reaches into."""
@@ -146,8 +148,8 @@ class CellGrid:
     def _filled_by_thin_shape(self, part: Solid, others: list[Solid], pitch: np.ndarray) -> Filled:
         """Return :meth:`filled` of a thin shape from its own test points, because the grid's points may miss it."""
         points = part.test_points(self._point_counts(np.maximum((part.upper - part.lower) / pitch, _MOST_SPLITS)))
-        point_count, free = _inside(part, others, points)
-        points = points[free]
+        inside, free = _inside(part, others, points)
+        point_count, points = np.count_nonzero(inside), points[free]
         coordinates = (points - self.lower) / self.sides
         index = np.clip(coordinates.astype(int), 0, self.counts - 1)
         index, cell = np.unique(index, axis=0, return_inverse=True)
@@ -184,9 +186,10 @@ def cells_over(parts: Sequence[Solid], earlier: Sequence[Solid], spacing: float,
     cells_before = np.ceil((face - lower) / sides - 1e-6)
     counts = (cells_before + np.ceil((upper - face) / sides - 1e-6)).astype(int)
     splits = np.maximum(np.ceil(_FINE_POINTS * sides / thin - 1e-6).astype(int), 1)
-    coarsest = 2 if len(parts) == 1 else 4  # a hammer of two shapes has an eigenvalue of -0.0005 with 8 instead
-    splits = np.where(splits > coarsest, -(-splits // 8) * 8, 4)  # demagnetizing tensors use 8 or 4 subcells
-    splits = splits if len(parts) == 1 else np.minimum(splits, _MOST_SPLITS)
+    if len(parts) == 1:
+        splits = -(-splits // 8) * 8  # demagnetizing tensors use 8 subcells
+    else:
+        splits = np.where(splits > 4, _MOST_SPLITS, 4)  # with 8 always, a hammer of two shapes has an eigenvalue < 0
     lower = face - cells_before * sides
     return CellGrid(solids, len(earlier), lower, sides, counts, splits, largest.position, largest.rotation)
 
@@ -220,10 +223,23 @@ def _in_frame_of(frame: Solid, part: Solid) -> Solid:
     return replace(part, position=(part.position - frame.position) @ frame.rotation, rotation=rotation)
 
 
-def _inside(part: Solid, others: list[Solid], points: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return the number of points in ``part``, and True for each point in ``part`` but in none of ``others``."""
-    free = part.contains(points)
-    inside = int(free.sum())
+def _inside(part: Solid, others: list[Solid], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return True for each point in ``part``, and for each point in ``part`` but in none of ``others``."""
+    inside = part.contains(points)
+    free = inside.copy()
     for other in others:
         free[free] = ~other.contains(points[free])
     return inside, free
+
+
+def _volume_factors(shares: np.ndarray, volume: float) -> np.ndarray:
+    """Return factors of the shares of cells inside a shape, so that their sum is its ``volume`` in cells, shape [m].
+
+    Only cells that the surface cuts change: a share s becomes s + c s (1 − s). Whole cells keep their volume, so that
+    fields of near cells, which are sums over subcells, and those of distant ones, which are dipoles, are of one body.
+    If it would need |c| > 1, it remains ±1.
+    """
+    cut = float(shares @ (1.0 - shares))
+    if cut == 0.0:
+        return np.ones(len(shares))
+    return 1.0 + np.clip((volume - shares.sum()) / cut, -1.0, 1.0) * (1.0 - shares)
