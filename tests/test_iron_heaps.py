@@ -29,6 +29,17 @@ def test_sweeps_that_diverge_end(device):
     assert verdict.passes and verdict.evaluations < 200
 
 
+@pytest.mark.parametrize(("number", "seed"), [(1374, 7), (648, 11)])
+def test_small_cells_inside_large_ones_converge(number, seed, device):
+    """Balls of small cells share little of a large cell's volume, but all of their own: steps must be short.
+
+    With the steps for the shares of the large cells these heaps did not converge in 1,000 evaluations.
+    """
+    heap = heaps.draw(number // heaps.BATCH, seed)[number % heaps.BATCH]
+    (verdict,) = heaps.SolvedHeaps([heap], device).verdicts(number)
+    assert verdict.passes and verdict.evaluations < 100
+
+
 SHEETS = {
     "inside": [((0.024, 0.024, 0.003), 0.0025, (0.0, 0.0, 0.0)), ((0.024, 0.024, 0.001), 0.0018, (0.0, 0.0, 0.0))],
     "turned": [((0.024, 0.024, 0.0005), 0.0022, (0.0, 0.0, 0.0)), ((0.024, 0.024, 0.0005), 0.0022, (0.0, 0.0, 0.3))],

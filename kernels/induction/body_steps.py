@@ -6,9 +6,9 @@ The residual of a body's moments, r = k H/Ms − s, becomes r + w (Q − 1) r wi
 
 Q belongs to χ = ∞ without saturation, and to bodies that do not intersect. Q multiplies a mode of eigenvalue λ by 1/λ.
 Saturation and overlap change this eigenvalue to λ' = 1 − d (1 − λ) + e. Here d is the mean of (k/3) ‖M‖/(Ms ‖s‖) over
-the body. e is the mean of k max(0, 2 o_i − 0.2) with the overlap o_i of ``theta_flow.py``: bodies that only touch have
-2 o_i ≤ 0.2. The weight w = max(0, (1/λ' − 1)/(1/λ − 1)), with the smallest λ of the body, is the largest that is safe
-for all modes. After a rejected step, w is 0 in the next few solves.
+the body. e is the mean of k max(0, o_i + f_i − 0.2) with o_i and f_i of ``theta_flow.py``: cells of bodies that only
+touch have o_i + f_i ≤ 0.2, if their sizes are similar. The weight w = max(0, (1/λ' − 1)/(1/λ − 1)), with the smallest λ
+of the body, is the largest that is safe for all modes. After a rejected step, w is 0 in the next few solves.
 
 Sweeps leave out the pairs within such a body. Letters in contact take half as many evaluations as with sweeps alone. A
 plate on a magnet takes a quarter as many. The elements of Q − 1 are stored as bfloat16, the upper 16 bits of float32:
@@ -25,15 +25,13 @@ import numpy as np
 import warp as wp
 
 from warpmag.kernels.induction.solve_state import state_type
-from warpmag.kernels.induction.theta_flow import FLOW_STEP
+from warpmag.kernels.induction.theta_flow import CONTACT, FLOW_STEP
 from warpmag.kernels.shared.native import CHUNK, PASS_ARGUMENTS, native_kernel
 from warpmag.kernels.shared.pieces import cut
 from warpmag.kernels.shared.reductions import group_threads
 from warpmag.kernels.shared.team import launch_passes, threads_for
 
 FOLD, WRITE_WEIGHTS, MULTIPLY, UNFOLD = range(4)  # the passes, in order; as in ``body_steps.h``
-_CONTACT = 0.2
-"""Twice the volume over its own that a cell's ball shares with balls of bodies in contact, up to which e is 0."""
 _MEMBERS = 4
 """Bodies with the same tables that threads of a GPU compute together: the sums of 8 do not fit into its registers."""
 _ENTRY = 9 * CHUNK
@@ -95,7 +93,7 @@ def _padded_images(images: np.ndarray) -> np.ndarray:
 def _kernel(dtype, members: int, group: int):
     call = "add_body_steps(thread, first, last, threads, team.data, steps)"
     arguments = {**PASS_ARGUMENTS, "steps": _steps_type(dtype)}
-    constants = dict(MEMBERS=members, GROUP=group, FLOW_STEP=FLOW_STEP, CONTACT=_CONTACT)
+    constants = dict(MEMBERS=members, GROUP=group, FLOW_STEP=FLOW_STEP, CONTACT=CONTACT)
     return native_kernel(call, "induction/body_steps.h", arguments, dtype=dtype, **constants)
 
 

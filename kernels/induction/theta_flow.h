@@ -2,7 +2,8 @@
 // theta_flow.py has its equations; theta_step.h chooses the next step of a world.
 //
 // On a CPU a pass works on a vector of moments of one world; on a GPU a group of threads works on one moment. Takes
-// CAPACITY, DEPTH, FLOW_STEP, GROUP and INVERSE_4PI from Python. ``State`` is the struct of solve_state.py.
+// CAPACITY, CONTACT, DEPTH, FLOW_STEP, GROUP, INVERSE_4PI and OVERLAP_DEMAGNETIZATION from Python. ``State`` is the
+// struct of solve_state.py.
 #pragma once
 #include "induction/spans.h"
 #include "induction/theta_step.h"
@@ -123,20 +124,26 @@ template <class State> CUDA_CALLABLE inline Number step_of(const State& state, c
     return numbers_or(entries(state.step, at), at.count, 1);
 }
 
-// Volume that balls share with other inducible balls, o_i = Σ_j |B_i ∩ B_j|/√(V_i V_j).
+// Stiffness 2/3 + o_i + f_i of moments, with o_i = Σ_j |B_i ∩ B_j|/√(V_i V_j) the volume that balls share with others.
 //
 // The field energy of uniformly magnetized balls is at most ½μ0 ∫‖Σ M_i‖². The eigenvalues of the coupling therefore
 // lie above 1/3 − (1 + max o_i), which is −2/3 without overlap. In the metric of 2/3 + o_i they lie above −1, since the
 // matrix of shared volumes is bounded by the diagonal matrix of its row sums. The resulting step lengths converge for
 // any arrangement, and are short only where balls overlap.
-template <class State> CUDA_CALLABLE inline Number total_overlap(const State& state, const Span& at) {
+//
+// Cells that act by tensors alone have a demagnetizing factor f_i of overlaps, too (``cells/cell_pairs.h``). Between
+// cells of one size it is at most o_i. Of a small cell inside a large one o_i is small, but f_i is not.
+template <class State> CUDA_CALLABLE inline Number stiffness_of(const State& state, const Span& at) {
     const Real* const labels = entries(state.packed, at, 7) - at.i;
     const Mask within_body = mask_of(numbers_or(entries(state.within_body, at), at.count, 1) > Real(0));
     auto others = [=](Index i, Index j) {
         const Mask same = mask_of(collect(labels, i) == collect(labels, j));
         return !same || (within_body && mask_of(j != i));
     };
-    return shared_volumes(state, at.i, at.count, at.begin, at.end, others);
+    const SharedVolumes shared = shared_volumes(state, at.i, at.count, at.begin, at.end, others);
+    const Number zero = shared.over_own * Real(0), inside = shared.over_own - CONTACT;
+    const Number factor = larger(shared.over_mean, smaller(inside, zero + OVERLAP_DEMAGNETIZATION));
+    return Real(2.0 / 3.0) + shared.over_mean + (within_body ? zero : factor);
 }
 
 // 4π times the neighbors' field [A/m] at the last solution plus ``ahead`` times its last change.
@@ -165,9 +172,7 @@ template <class State> CUDA_CALLABLE inline void start(State& state, const Span&
     const Real ahead = (Real)world.ahead;
     const Four ball = balls_at(state, at);
     const Material material = material_of(state, at);
-    // Cells that act by tensors alone have the demagnetizing factor of overlaps, too, which is at most the share.
-    const Number twice = 2 - numbers_or(entries(state.within_body, at), at.count, 1);
-    const Number omega = step_length<Real>(material.slope * (twice * total_overlap(state, at) + Real(2.0 / 3.0)));
+    const Number omega = step_length<Real>(material.slope * stiffness_of(state, at));
     Vector near = {0, 0, 0};
     if (warm == STEADY) near = extrapolated_field(state, at, ball, ahead);
     if (share() != 0) return;

@@ -11,10 +11,10 @@ k H(M)/Ms and the residual r = g − s. With the last few changes Δs_j, Δr_j, 
 
 The weight φ = Ms c(a)/a, a = max(‖s‖, ‖g‖), converts a residual to magnetization, so that the large s of saturated
 moments does not dominate. The plain step is mirror descent on the energy divided by μ0, Σ V [Φ(M) − ½ M·GM − H0·M]. It
-is convex for the ball-averaged kernel. Let L_i = 1 + k (2/3 + o_i), with o_i the volume that a ball shares with others,
-relative to its own (``total_overlap`` in ``theta_flow.h``). The energy decreases from any state for ω_i ≤ 1/L_i, and
-near the solution the steps converge for ω_i < 2/L_i. Steps are short only where balls overlap. Cells of bodies that
-take steps as a whole (``body_steps.py``) count o_i twice, because of the demagnetizing factor of overlaps.
+is convex for the ball-averaged kernel. Let L_i = 1 + k (2/3 + o_i + f_i), with o_i the volume that a ball shares with
+others, relative to its own (``stiffness_of`` in ``theta_flow.h``). The energy decreases from any state for ω_i ≤ 1/L_i,
+and near the solution the steps converge for ω_i < 2/L_i. Steps are short only where balls overlap. Cells of bodies that
+take steps as a whole (``body_steps.py``) have a demagnetizing factor f_i of overlaps, others have f_i = 0.
 
 Let a mixture be a vector s̄. After as many evaluations as stored changes, the newest stored change is replaced if the
 current iterate is the best so far. The new one is the difference between the current s̄ and the previous s̄. The
@@ -75,6 +75,7 @@ from functools import cache
 
 import warp as wp
 
+from warpmag.kernels.cells.cell_pairs import OVERLAP_DEMAGNETIZATION
 from warpmag.kernels.induction.solve_state import COLUMNS, DEPTH, state_type, world_summation
 from warpmag.kernels.material.curves import inverse_curve_ratio
 from warpmag.kernels.pairs.neighbors import CAPACITY
@@ -86,6 +87,8 @@ from warpmag.kernels.shared.team import MOMENTS_PER_THREAD, launch_passes, threa
 START, FIRST_SWEEP, LAST_SWEEP, MEASURE, CHOOSE, ADVANCE = range(6)  # passes in order; as in ``theta_flow.h``
 FLOW_STEP = 0.9
 """Step length over the largest convergent one."""
+CONTACT = 0.2
+"""Overlap of cells of bodies in contact. Their balls overlap, but not the cells themselves."""
 _START_THREADS = 256
 """Most threads of a GPU's block at the start of a solve, where a moment takes a group of threads."""
 _RESIDENT_BLOCKS = {wp.float32: (3, 5, 2), wp.float64: (2, 3, 1)}
@@ -95,6 +98,7 @@ that compilers use."""
 
 def _constants(group: int) -> dict:
     constants = {"GROUP": group, "CAPACITY": CAPACITY, "DEPTH": DEPTH, "FLOW_STEP": FLOW_STEP}
+    constants |= {"CONTACT": CONTACT, "OVERLAP_DEMAGNETIZATION": OVERLAP_DEMAGNETIZATION}
     return constants | {"INVERSE_4PI": INVERSE_4PI}
 
 

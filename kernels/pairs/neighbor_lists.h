@@ -49,11 +49,15 @@ inline void walk_lists(const int* lists, const int* counts, Index i, int lane_co
 }
 #endif
 
-// Shared volumes Σ_j |B_i ∩ B_j|/√(V_i V_j) of ``lane_count`` moments from i on, over sources j from begin to end that
-// accepts(i, j) selects. ``lists`` has the packed moments and the overlap lists.
+// Volumes that balls share with others, Σ_j |B_i ∩ B_j|, over √(V_i V_j) and over the own volume V_i.
+struct SharedVolumes {
+    Number over_mean, over_own;
+};
+// Shared volumes of ``lane_count`` moments from i on, over sources j from begin to end that accepts(i, j) selects.
+// ``lists`` has the packed moments and the overlap lists.
 template <class Lists, class Accepts>
-CUDA_CALLABLE inline Number shared_volumes(const Lists& lists, int i, int lane_count, int begin, int end,
-                                           Accepts accepts) {
+CUDA_CALLABLE inline SharedVolumes shared_volumes(const Lists& lists, int i, int lane_count, int begin, int end,
+                                                  Accepts accepts) {
     const Real* const packed = (const Real*)lists.packed.data;
     const size_t pitch = lists.packed.strides[0] / sizeof(Real);
     Index self = Index(i);
@@ -63,15 +67,18 @@ CUDA_CALLABLE inline Number shared_volumes(const Lists& lists, int i, int lane_c
     auto row = [&](int c, auto j) { return Number(Real(0)) + collect(packed + c * pitch, j); };
     const Vector x = {row(0, self), row(1, self), row(2, self)};
     const Number radius = row(3, self);
-    Number volume = 0;
+    SharedVolumes sums = {Number(Real(0)), Number(Real(0))};
     auto add = [&](auto j, Mask listed) {
         const Vector r = {x.x - row(0, j), x.y - row(1, j), x.z - row(2, j)};
         const Number other_radius = row(3, j), contact = radius + other_radius;
         const Mask overlapping = listed & (dot(r, r) < contact * contact);
         if (!any(overlapping)) return;
-        volume += shared_volume(dot(r, r), radius, other_radius, overlapping & accepts(self, Index(j)));
+        const Number volume = shared_volume(dot(r, r), radius, other_radius, overlapping & accepts(self, Index(j)));
+        const Number ratio = overlapping ? other_radius / radius : Number(Real(1));
+        sums.over_mean += volume;
+        sums.over_own += volume * ratio * root(ratio);
     };
     walk_lists(lists.overlap.data, lists.overlap_count.data, self, lane_count, Index(begin), Index(end), add);
-    return group_sum(volume);
+    return {group_sum(sums.over_mean), group_sum(sums.over_own)};
 }
 }
