@@ -96,7 +96,7 @@ def test_volume_and_centroid_are_exact_and_second_moments_approach_the_solid(nam
     np.testing.assert_allclose(lacking, cell**2 / 12, atol=0.15 * cell**2 / 12 + 5e-3 * second.max())
     off_diagonal = second_moments(body) - np.diag(second_moments(body).diagonal())
     np.testing.assert_allclose(off_diagonal, 0.0, atol=1e-12 * second.max())
-    assert body.volumes.min() >= 0.29 * np.median(body.volumes)  # no slivers; whole cells are in the majority
+    assert body.volumes.min() >= 0.31 * np.median(body.volumes)  # no slivers; whole cells are in the majority
 
 
 def test_a_box_is_filled_by_equal_cells():

@@ -4,9 +4,10 @@
 // points are closer together. With the points of the longer box the operator of induction would have negative
 // eigenvalues, for a sheet of long cells that lies on a sheet of shorter, thicker cells. Beside a flat box the field
 // varies more over its faces, so 4 × 4 × 2 points replace them there. One of a pair may be a ball: a ball's field is a
-// closed form, too, and the average over a ball is the value at its center. Boxes farther apart differ from balls by
-// their quadrupoles. A window function ends this difference. Forces are the exact derivatives of the energy
-// −μ0 m_i·T_ij·m_j, so that they conserve energy and momentum. Lengths are in units of the mean of the boxes' sizes.
+// closed form, too, and the average over a ball is the value at its center. Then the field is that of the larger
+// volume, because a long box may lie inside a ball. Boxes farther apart differ from balls by their quadrupoles. A
+// window function ends this difference. Forces are the exact derivatives of the energy −μ0 m_i·T_ij·m_j, so that they
+// conserve energy and momentum. Lengths are in units of the mean of the boxes' sizes.
 //
 // From Python: WINDOW_BEGIN, WINDOW_END, CLOSE_BEGIN, CLOSE_END, FINE_BEGIN and FINE_END, distances of the windows.
 #pragma once
@@ -73,7 +74,9 @@ CUDA_CALLABLE inline BoxPair box_pair(const Boxes& own, const Boxes& other, cons
     const Vector r = unit * pose.r;
     const Number d = length(r);
     const Number own_longest = longest_of(own), other_longest = longest_of(other);
-    const Mask own_shorter = own_longest < SHORTER * other_longest, alike = own_longest * SHORTER <= other_longest;
+    const Mask balls = own.ball | other.ball;
+    const Number own_size = balls ? own.radius : own_longest, other_size = balls ? other.radius : other_longest;
+    const Mask own_shorter = own_size < SHORTER * other_size, alike = own_size * SHORTER <= other_size;
     const Mask own_points = own_shorter | (own_first & alike);
     const Mask flat = own_points ? own.flat : other.flat;
     const Number per_side = 1 / (unit * (own_longest + other_longest)); // from units of the pair to mean longest sides
@@ -104,13 +107,6 @@ CUDA_CALLABLE inline BoxView view_upper_half(Vector r, Vector half, int axis) {
 }
 CUDA_CALLABLE inline Vector column(const Symmetric& t, int k) {
     return k == 0 ? Vector{t.xx, t.xy, t.zx} : k == 1 ? Vector{t.xy, t.yy, t.yz} : Vector{t.zx, t.yz, t.zz};
-}
-
-CUDA_CALLABLE inline Symmetric operator+(const Symmetric& a, const Symmetric& b) {
-    return {a.xx + b.xx, a.yy + b.yy, a.zz + b.zz, a.xy + b.xy, a.yz + b.yz, a.zx + b.zx};
-}
-CUDA_CALLABLE inline Symmetric operator*(Number k, const Symmetric& a) {
-    return {k * a.xx, k * a.yy, k * a.zz, k * a.xy, k * a.yz, k * a.zx};
 }
 
 // A tensor of the frame of j in the frame of i.

@@ -28,6 +28,12 @@ struct Traceless {
 struct Symmetric {
     Number xx, yy, zz, xy, yz, zx;
 };
+CUDA_CALLABLE inline Symmetric operator+(const Symmetric& a, const Symmetric& b) {
+    return {a.xx + b.xx, a.yy + b.yy, a.zz + b.zz, a.xy + b.xy, a.yz + b.yz, a.zx + b.zx};
+}
+CUDA_CALLABLE inline Symmetric operator*(Number k, const Symmetric& a) {
+    return {k * a.xx, k * a.yy, k * a.zz, k * a.xy, k * a.yz, k * a.zx};
+}
 
 CUDA_CALLABLE inline Number length(Vector a) { return root(dot(a, a)); }
 CUDA_CALLABLE inline Vector operator*(Traceless t, Vector a) {

@@ -2,7 +2,7 @@
 
 A body that is not a ball is replaced by moments of volume Vᵢ at xᵢ. ΣVᵢ is the volume of the body, and ΣVᵢxᵢ/ΣVᵢ its
 centroid. Nearly cubic cells divide the bounding box of each shape exactly. The moment of a cell is at the centroid of
-the part that the shape fills. Cells filled by less than 0.3, or a half in a body of several shapes, join their
+the part that the shape fills. Cells filled by less than 0.32, or a half in a body of several shapes, join their
 nearest neighbor, so that a curved surface has neither steps nor slivers. Where possible, the faces of a single mesh,
 such as the sides of the strokes of a letter, lie between cells of its grid. The filled part is found from a fine grid
 of test points. Where shapes of a body overlap, each test point counts once.
@@ -67,7 +67,7 @@ LONGEST = 1.25
 """Largest ratio of a cell's longest side to the next one at automatic spacing. Longer cells are poor dipoles along a
 rod."""
 
-_JOINED = 0.3, 0.5
+_JOINED = 0.32, 0.5
 """Shares of a whole cell below which a cell joins a neighbor, in bodies of one shape and of several. Near cells of
 different bodies act on each other as boxes, but joined cells are not boxes: with 0.42 for one shape, forces in a stack
 of five discs were up to 29 % too large. Several shapes share cells: a third would leave many small parts."""
