@@ -170,7 +170,7 @@ def draw(lines, path: Path) -> None:
         counts = [line["count"] for line in points]
         times.plot(counts, [1e3 * line["seconds"] for line in points], label=label, **style)
         accuracy.plot(counts, [line["error"] for line in points], **style)
-    times.legend(fontsize="x-small")
+    times.legend(fontsize="small", handlelength=3.5)  # long enough for two dashes
     for axis, quantity in ((times, "time [ms]"), (accuracy, "relative error")):
         axis.set(xscale="log", yscale="log", xlabel="moments", ylabel=quantity)
         axis.grid(True, alpha=0.3)
