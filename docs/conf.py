@@ -3,6 +3,7 @@
 import os
 import re
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 from docutils import nodes
@@ -92,9 +93,31 @@ def _commands() -> str:
     )
 
 
+def _arrows(flowchart: re.Match) -> str:
+    """Return a table of the arrows in a Mermaid flowchart, which Sphinx does not draw."""
+    node, nodes, targets = r'(\w+)(?:\["<b>(.+?)</b><br>(.+)"\])?', {}, {}
+    for line in flowchart[1].splitlines()[1:]:
+        names = []
+        for part in line.split("-->"):
+            name, title, subject = re.fullmatch(node, part.strip()).groups()
+            if title:
+                nodes[name] = title, subject.replace("<br>", " ")
+            names.append(name)
+        for first, second in pairwise(names):
+            targets.setdefault(first, []).append(second)
+    rows = (
+        f"| `{title}` | {subject} | "
+        + ", ".join(f"`{nodes[target][0]}`" for target in targets.get(name, []))
+        + " |\n"
+        for name, (title, subject) in nodes.items()
+    )
+    return "| room | subject | arrows to |\n|---|---|---|\n" + "".join(rows)
+
+
 def _file(name: str) -> str:
     """Return the text of a file outside this folder. Links to pages are adapted, other links to files removed."""
-    text = (ROOT / name).read_text(encoding="utf-8").replace("```mermaid", "```text")
+    text = (ROOT / name).read_text(encoding="utf-8")
+    text = re.sub(r"```mermaid\n(.+?)```\n", _arrows, text, flags=re.DOTALL)
     text = re.sub(r"\[([^]]+)\]\(docs/([\w/]+\.md(?:#[\w-]+)?)\)", r"[\1](\2)", text)
     return re.sub(
         r"\[([^]]+)\]\(([\w.]+)(#[\w-]+)?\)",
