@@ -132,7 +132,7 @@ template <class State> CUDA_CALLABLE inline Number step_of(const State& state, c
 // any arrangement, and are short only where balls overlap.
 //
 // Cells that act by tensors alone have a demagnetizing factor f_i of overlaps, too (``cells/cell_pairs.h``). Between
-// cells of one size it is at most o_i. Of a small cell inside a large one o_i is small, but f_i is not.
+// cells of one size it is at most o_i. For a small cell inside a large one o_i is small, but f_i is not.
 template <class State> CUDA_CALLABLE inline Number stiffness_of(const State& state, const Span& at) {
     const Real* const labels = entries(state.packed, at, 7) - at.i;
     const Mask within_body = mask_of(numbers_or(entries(state.within_body, at), at.count, 1) > Real(0));

@@ -11,10 +11,10 @@ k H(M)/Ms and the residual r = g − s. With the last few changes Δs_j, Δr_j, 
 
 The weight φ = Ms c(a)/a, a = max(‖s‖, ‖g‖), converts a residual to magnetization, so that the large s of saturated
 moments does not dominate. The plain step is mirror descent on the energy divided by μ0, Σ V [Φ(M) − ½ M·GM − H0·M]. It
-is convex for the ball-averaged kernel. Let L_i = 1 + k (2/3 + o_i + f_i), with o_i the volume that a ball shares with
-others, relative to its own (``stiffness_of`` in ``theta_flow.h``). The energy decreases from any state for ω_i ≤ 1/L_i,
-and near the solution the steps converge for ω_i < 2/L_i. Steps are short only where balls overlap. Cells of bodies that
-take steps as a whole (``body_steps.py``) have a demagnetizing factor f_i of overlaps, others have f_i = 0.
+is convex for the ball-averaged kernel. Let L_i = 1 + k (2/3 + o_i + f_i), with o_i the volumes that a ball shares with
+others, over the roots of the products of both volumes (``stiffness_of`` in ``theta_flow.h``). The energy decreases from
+any state for ω_i ≤ 1/L_i, and near the solution the steps converge for ω_i < 2/L_i. Cells of bodies that take steps as
+a whole (``body_steps.py``) have a demagnetizing factor f_i of overlaps, others have f_i = 0.
 
 Let a mixture be a vector s̄. After as many evaluations as stored changes, the newest stored change is replaced if the
 current iterate is the best so far. The new one is the difference between the current s̄ and the previous s̄. The
@@ -68,7 +68,7 @@ before it. So the start follows smooth motion, and ignores noise.
 
 The changes Δs_j, Δr_j are kept for the next solve, since the coupling hardly changes. A slow mode, such as that of long
 columns of balls, then costs one evaluation instead of three. Balls Up, where 243 balls jump, takes 1.2 evaluations per
-solve. The solve converges to the same solution from any start.
+solve. Where the equilibrium is unique, every start leads to the same solution.
 """
 
 from functools import cache

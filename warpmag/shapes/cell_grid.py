@@ -11,7 +11,8 @@ from warpmag.shapes.solids import Solid, boxes_meet, grid
 _FINE_POINTS = 32
 """Smallest number of test points along each axis of a shape, unless ``_MOST_SPLITS`` limits it."""
 _MOST_SPLITS = 8
-"""Largest number of test points along each axis of a cell, if several shapes share a grid."""
+"""Number of test points along each axis of a cell, if several shapes share a grid. Cells that are small beside the
+thinnest shape have 4."""
 _FLATTEST = 4.0
 """Largest ratio of spacing to cell side in a shared grid, where thin shapes get several cells across."""
 _SMALL = 0.1
@@ -19,10 +20,10 @@ _SMALL = 0.1
 _WIDEST = 1.25
 """Largest factor by which a side of a cell changes, to place faces of a mesh between cells."""
 _DEVIATION = 0.2
-"""Cost of a change of a side, over its squared logarithm. A change by a fifth costs as much as a face in the middle of
-a cell, of 3 % of the cross-section."""
+"""Cost of a change of a side by a factor, over the squared logarithm of the factor. A factor of 1.2 costs as much as
+a face of 3 % of the cross-section in the middle of a cell."""
 _MOST_POINTS = 1 << 23
-"""Largest number of test points of a shape that are not evaluated in chunks: 200 MB, and a few seconds."""
+"""Largest number of test points of a shape (200 MB, and a few seconds). More of them raise an error."""
 _CHUNK = 1 << 18
 """Test points evaluated at a time (some tens of MB)."""
 
@@ -105,7 +106,7 @@ class CellGrid:
     def _hits(self, part: Solid, others: list[Solid]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the cells with test points in a shape, shape [m, 3], and the number of these points, shape [m].
 
-        The third value is True for those of them outside ``others``, shape [m, points of a cell].
+        The third value is True for test points in the shape, but not in ``others``, shape [m, points of a cell].
         """
         index, offsets = self._cells_near(part), self._offsets()
         cells = self.lower + (index + 0.5) * self.sides
@@ -197,7 +198,8 @@ def cells_over(parts: Sequence[Solid], earlier: Sequence[Solid], spacing: float,
 def _fit_steps(part: Solid, fit: np.ndarray, across: int) -> np.ndarray:
     """Return numbers of cells along each axis near ``fit`` for which faces of the shape lie between cells.
 
-    A face inside a cell costs its area times the square of its distance from the nearest face of the cell.
+    A face inside a cell costs its share of the cross-section times its squared distance [cells] from the nearest face
+    of the cell.
     """
     extent, result = part.upper - part.lower, fit.copy()
     for axis in range(3):
@@ -235,9 +237,9 @@ def _inside(part: Solid, others: list[Solid], points: np.ndarray) -> tuple[np.nd
 def _volume_factors(shares: np.ndarray, volume: float) -> np.ndarray:
     """Return factors of the shares of cells inside a shape, so that their sum is its ``volume`` in cells, shape [m].
 
-    Only cells that the surface cuts change: a share s becomes s + c s (1 − s). Whole cells keep their volume, so that
-    fields of near cells, which are sums over subcells, and those of distant ones, which are dipoles, are of one body.
-    If it would need |c| > 1, it remains ±1.
+    Only cells that the surface cuts change: a share s becomes s + c s (1 − s). Whole cells keep their volume. So the
+    fields of near cells (sums over subcells) and those of distant cells (dipoles) belong to the same body. c is limited
+    to ±1.
     """
     cut = float(shares @ (1.0 - shares))
     if cut == 0.0:

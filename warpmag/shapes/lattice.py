@@ -1,7 +1,7 @@
 """Lattices of moments that fill a solid body.
 
 A body that is not a ball is replaced by moments of volume Vᵢ at xᵢ. ΣVᵢ is the volume of the body, and ΣVᵢxᵢ/ΣVᵢ its
-centroid. Nearly cubic cells divide the bounding box of each shape exactly. The moment of a cell is at the centroid of
+centroid. Nearly cubic cells divide the bounding box of a shape exactly. The moment of a cell is at the centroid of
 the part that the shape fills. Cells filled by less than 0.32, or a half in a body of several shapes, join their
 nearest neighbor, so that a curved surface has neither steps nor slivers. Where possible, the faces of a single mesh,
 such as the sides of the strokes of a letter, lie between cells of its grid. The filled part is found from a fine grid
@@ -9,7 +9,8 @@ of test points. Where shapes of a body overlap, each test point counts once.
 
 The accuracy determines :data:`AUTOMATIC_COUNT`. The table lists errors of a uniformly magnetized cube of side L as n³
 point dipoles. The field's error is a relative L2 norm over all points at distance d from the surface. The force acts on
-an iron ball of radius L/8 in contact (5 mm at a cube of 40 mm). Its error is equal for linear and saturated balls.
+an iron ball of radius L/8 (5 mm at a cube of 40 mm) with its center at the distance d: at L/8 it is in contact. The
+error of the force is equal for linear and saturated balls.
 
 ====  =====  ==============  ============  ==============  ============
 n     n³     field, d=0.2 L  field, d=L/8  force, d=0.2 L  force, d=L/8
@@ -70,7 +71,8 @@ rod."""
 _JOINED = 0.32, 0.5
 """Shares of a whole cell below which a cell joins a neighbor, in bodies of one shape and of several. Near cells of
 different bodies act on each other as boxes, but joined cells are not boxes: with 0.42 for one shape, forces in a stack
-of five discs were up to 29 % too large. Several shapes share cells: a third would leave many small parts."""
+of five discs were up to 29 % too large. In bodies of several shapes, which share cells, a third would leave many small
+parts."""
 
 _STEP = 1.02
 """Ratio of successive trial spacings."""
