@@ -273,7 +273,7 @@ def coupling(lattice: Lattice, radii: np.ndarray) -> Coupling:
 
 
 def _boxes(part: Pieces, volumes: np.ndarray) -> np.ndarray:
-    """Return the half sides of the cells' boxes [m], shape [n, 3]."""
+    """Return half sides of boxes with the volumes of the cells and the ratios of their second moments [m], [n, 3]."""
     filled = np.bincount(part.moment, part.share * part.filled.mean(axis=(1, 2, 3))[part.piece])
     squares = np.einsum("nkk->nk", _spreads(part, 0, filled))
     half = np.sqrt(3.0 * squares)
