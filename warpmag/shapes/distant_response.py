@@ -10,17 +10,18 @@ the cells up to the tolerance if their response P has EᵀPE = Q. With the pseud
 with fields and magnetizations times the roots of volumes, so that a uniform magnetization stays uniform. The second
 term lets the moments respond to other fields as well, so that P has an inverse: the moments follow a magnetization
 curve like cells. Their own field is T = (1/3 − P⁻¹)/V, since a ball of ideal permeability has the response 3. Each
-point is the centroid of a group of cells.
+point is the centroid of a group of cells. The groups are narrower near the ends of the body, where the charges are.
 
-There are several levels, :data:`FEW_LEVELS`: the nearer the surface, the more combinations and points. The smallest
-distance of a level follows from the forces on ball magnets around the body, which act as dipoles. The diameter of each
-ball equals its distance from the body. At the smallest distance of a level the largest error of these forces, over
-several places and directions, is at most :data:`BALL_ERROR`. It falls with the third power of the distance or faster.
-The median error is a fifth of the largest, and errors for larger magnets are smaller.
+There are several levels, :data:`FAR_TO_NEAR`: the nearer the surface, the more combinations and points. The number of
+points follows from the forces on ball magnets around the body, which act as dipoles. The diameter of each ball equals
+its distance from the body. A level has the fewest points with which the largest error of these forces, over several
+places and directions, is at most :attr:`Level.error` at its smallest distance. If no number of points suffices, the
+distance is larger instead, because the error falls with the third power of the distance or faster. The median error is
+a fifth of the largest.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,16 +31,16 @@ from warpmag.shapes.uniform_response import cell_matrix
 
 @dataclass(frozen=True)
 class Level:
-    """Number of moments that replace a body, and the distance of the surface of charges."""
+    """Smallest distance of a level, which is that of the surface of charges, and the error there."""
 
     distance: float  # from the body's box, in halves of its longest side
-    most_points: int  # largest number of moments
+    error: float  # largest relative error of the force of a ball magnet whose diameter is this distance
 
 
-FEW_LEVELS = Level(3.0, 27), Level(0.7, 100), Level(0.3, 196)
-"""From far to near. 27 points are 3 × 3 × 3 in a cube and 5 × 5 in a plate."""
-BALL_ERROR = 0.05
-"""Largest relative error of the force of a ball magnet at the smallest distance, which is its diameter."""
+FAR_TO_NEAR = Level(3.0, 0.005), Level(1.2, 0.01), Level(0.6, 0.01), Level(0.3, 0.02)
+"""Levels of distances. Far away a few more moments cost little, so errors are smaller there."""
+POINT_COUNTS = 8, 9, 12, 16, 20, 25, 36, 49, 64, 81, 100, 125, 144, 196
+"""Largest numbers of points that are tried at a level."""
 LEAST_REPLACED_CELLS = 65
 """Smallest number of cells of a body that few moments replace."""
 MOST_REPLACED_CELLS = 1000
@@ -49,8 +50,9 @@ _SOURCE_SPACING = 0.75
 _LEAST_FIELD = 0.003
 """Smallest singular value of a combination of fields that gets a response, over the largest, at the cells and at the
 points."""
-_TESTS = 24
-"""Number of dipoles whose forces are compared."""
+_EDGE_WEIGHT = 0.8
+"""Weight of Chebyshev's points over equal steps in the ends of groups of cells. In plates this lowers errors 2 to 10
+times."""
 _OTHER_RESPONSE = 1.0
 """Response ε to other fields: that of a sheet to a field normal to it."""
 
@@ -86,26 +88,53 @@ class DistantBody:
 def distant_bodies(body, coupling: Coupling) -> list[DistantBody] | None:
     """Return the few moments of a body at each level, or None if rounding leaves no response.
 
-    The levels are the first of :data:`FEW_LEVELS`, while the body has more than twice as many cells as moments.
+    A level is left out if it has more than three quarters of the moments of the next one, or of the cells.
 
     Args:
         body: The cells, with ``positions`` [m], ``volumes`` [m³] and ``radii`` [m].
         coupling: Tensors between the cells.
     """
-    levels = [level for level in FEW_LEVELS if 2 * level.most_points < len(body.volumes)]
-    charges = [_charges(*_box(body), level.distance) for level in levels]
     try:
-        bases = [_basis(_scaled_fields(body.positions, body.volumes, x)) for x in charges]
-        balls = [_charges(*_box(body), 1.5 * level.distance) for level in levels]
-        tests = [_Tests.at(x, body.positions, body.volumes) for x in balls]
-        fields = [fields for (cells, _), test in zip(bases, tests, strict=True) for fields in (cells, test.fields)]
-        ends = np.cumsum([field.shape[1] for field in fields])[:-1]
-        responses = np.split(_solve(body, coupling, np.hstack(fields)), ends, axis=1)
-        parts = zip(levels, charges, balls, bases, tests, responses[::2], responses[1::2], strict=True)
-        bodies = [_few_moments(body, *part) for part in parts]
+        bodies = [_fewest_moments(body, response) for response in _responses(body, coupling)]
     except np.linalg.LinAlgError:
         return None
-    return None if None in bodies else bodies  # type: ignore[return-value]
+    kept, moments = [], len(body.volumes)
+    for few in reversed(bodies):
+        if 4 * len(few.volumes) <= 3 * moments:
+            kept.append(few)
+            moments = len(few.volumes)
+    return kept[::-1] or None
+
+
+@dataclass(frozen=True)
+class _Response:
+    """Fields of sources at the distance of a level, and the response of the cells, both times the roots of volumes."""
+
+    level: Level
+    charges: np.ndarray  # places of the charges, shape [s, 3]
+    combinations: np.ndarray  # of their fields, shape [s, p]
+    fields: np.ndarray  # these combinations at the cells, shape [3 n, p]
+    patterns: np.ndarray  # magnetizations of the cells in these fields, shape [3 n, p]
+    balls: np.ndarray  # places of ball magnets, shape [b, 3]
+    forces: np.ndarray  # forces of these balls on the cells, in three directions each, shape [3, 3 b]
+
+
+def _responses(body, coupling: Coupling) -> list[_Response]:
+    """Return the fields and the responses of the cells at all levels."""
+    box = _box(body)
+    charges = [_charges(*box, level.distance) for level in FAR_TO_NEAR]
+    balls = [_ball_places(*box, 1.5 * level.distance) for level in FAR_TO_NEAR]
+    bases = [_basis(_scaled_fields(body.positions, body.volumes, x)) for x in charges]
+    tests = [_Tests.at(x, body.positions, body.volumes) for x in balls]
+    fields = [fields for (cells, _), test in zip(bases, tests, strict=True) for fields in (cells, test.fields)]
+    ends = np.cumsum([field.shape[1] for field in fields])[:-1]
+    responses = np.split(_solve(body, coupling, np.hstack(fields)), ends, axis=1)
+    return [
+        _Response(level, places, combinations, cells, patterns, ball, test.forces(magnetized))
+        for level, places, (cells, combinations), patterns, ball, test, magnetized in zip(
+            FAR_TO_NEAR, charges, bases, responses[::2], balls, tests, responses[1::2], strict=True
+        )
+    ]
 
 
 @dataclass(frozen=True)
@@ -117,64 +146,77 @@ class _Tests:
 
     @classmethod
     def at(cls, places: np.ndarray, points: np.ndarray, volumes: np.ndarray) -> "_Tests":
-        """Return the fields of dipoles at some of ``places``, in the directions of axes."""
-        chosen = np.unique(np.linspace(0, len(places) - 1, _TESTS).astype(int))
-        axis, unit = np.arange(len(chosen)) % 3, np.eye(3)
-        r = points[:, None] - places[chosen]
-        d, m, along = np.linalg.norm(r, axis=2)[..., None], unit[axis], r[:, np.arange(len(chosen)), axis, None]
+        """Return the fields of dipoles at ``places`` in the directions of all axes."""
+        places, axis = np.repeat(places, 3, axis=0), np.tile(np.arange(3), len(places))
+        unit = np.eye(3)
+        r = points[:, None] - places
+        d, m, along = np.linalg.norm(r, axis=2)[..., None], unit[axis], r[:, np.arange(len(axis)), axis, None]
         fields = 3.0 * r * along / d**5 - m / d**3
         outer = r[..., :, None] * m[:, None] + m[:, :, None] * r[..., None, :] + along[..., None] * unit
         gradients = 3.0 * outer / d[..., None] ** 5 - 15.0 * (along * r / d**7)[..., None] * r[..., None, :]
         root = np.sqrt(volumes)[:, None, None]
         fields, gradients = (root * fields).transpose(0, 2, 1), (root[..., None] * gradients).transpose(0, 2, 3, 1)
-        return cls(fields.reshape(-1, len(chosen)), gradients.reshape(-1, 3, len(chosen)))
+        return cls(fields.reshape(-1, len(axis)), gradients.reshape(-1, 3, len(axis)))
 
     def forces(self, magnetizations: np.ndarray) -> np.ndarray:
         """Return the forces of the dipoles on magnetizations times the roots of volumes, shape [3, t]."""
         return np.einsum("ikt,it->kt", self.gradients, magnetizations)
 
 
-def _few_moments(
-    body, level: Level, charges: np.ndarray, balls: np.ndarray, basis, tests: _Tests, patterns, magnetized
-) -> DistantBody | None:
-    """Return the moments of a level.
+def _fewest_moments(body, response: _Response) -> DistantBody:
+    """Return the fewest moments with the error of a level, or the most that are tried, with a larger distance."""
+    allowed = response.level.error
+    for count in (count for count in POINT_COUNTS if count < len(body.volumes)):
+        few, error = _few_moments(body, response, count)
+        if error <= allowed:
+            break
+    return replace(few, reach=few.reach * max(1.0, float(np.cbrt(error / allowed))))
 
-    ``basis`` is :func:`_basis` at the cells, and ``patterns`` are the magnetizations of the cells in these fields.
-    ``tests`` are the fields at the cells of dipoles at ``balls``, and ``magnetized`` the magnetizations in them.
-    """
-    volumes, part, (cells, combinations) = body.volumes, _parts(body.positions, level.most_points), basis
+
+def _few_moments(body, response: _Response, count: int) -> tuple[DistantBody, float]:
+    """Return at most ``count`` moments in place of the cells, and the largest relative error of a ball's force."""
+    volumes, part = body.volumes, _parts(body.positions, count)
     shares = np.bincount(part, volumes)
     points = np.stack([np.bincount(part, volumes * x) for x in body.positions.T], axis=1) / shares[:, None]
-    left, values, right = np.linalg.svd(_scaled_fields(points, shares, charges) @ combinations, full_matrices=False)
+    fields = _scaled_fields(points, shares, response.charges) @ response.combinations
+    left, values, right = np.linalg.svd(fields, full_matrices=False)
     rank = int((values > _LEAST_FIELD * values[0]).sum())
     left, inverse = left[:, :rank], (right[:rank].T / values[:rank]) @ left[:, :rank].T
-    response = inverse.T @ cells.T @ patterns @ inverse
-    response = 0.5 * (response + response.T) + _OTHER_RESPONSE * (np.eye(len(left)) - left @ left.T)
-    inverse_response = np.linalg.inv(response)
-    if not (
-        np.isfinite(inverse_response).all()
-        and np.isfinite(patterns).all()
-        and np.linalg.eigvalsh(inverse_response)[0] > 0.0
-    ):
-        return None  # rounding, in wires longer than 1e9 radii
-    few, expected = _Tests.at(balls, points, shares), tests.forces(magnetized)
-    error = np.linalg.norm(few.forces(response @ few.fields) - expected, axis=0) / np.linalg.norm(expected, axis=0)
+    matrix = inverse.T @ response.fields.T @ response.patterns @ inverse
+    matrix = 0.5 * (matrix + matrix.T) + _OTHER_RESPONSE * (np.eye(len(left)) - left @ left.T)
+    inverse_response = np.linalg.inv(matrix)
+    finite = np.isfinite(inverse_response).all() and np.isfinite(response.patterns).all()
+    if not (finite and np.linalg.eigvalsh(inverse_response)[0] > 0.0):
+        raise np.linalg.LinAlgError("rounding leaves no response")  # in wires longer than 1e9 radii
+    test = _Tests.at(response.balls, points, shares)
+    errors = np.linalg.norm(test.forces(matrix @ test.fields) - response.forces, axis=0)
     root, cell_root = np.repeat(np.sqrt(shares), 3), np.repeat(np.sqrt(volumes), 3)
-    patterns = (patterns / cell_root[:, None]).reshape(len(volumes), 3, -1)
+    patterns = (response.patterns / cell_root[:, None]).reshape(len(volumes), 3, -1)
     lower, upper = _box(body)
-    distance = level.distance * 0.5 * float((upper - lower).max())
-    return DistantBody(
+    few = DistantBody(
         _coupling(points, shares, inverse_response / (root[:, None] * root)), shares, lower, upper,
         coefficients=inverse @ inverse_response / root, patterns=patterns.transpose(1, 2, 0).copy(),
-        reach=distance * max(1.0, float(np.cbrt(error.max() / BALL_ERROR))),
+        reach=response.level.distance * 0.5 * float((upper - lower).max()),
     )  # fmt: skip
+    return few, float((errors / np.linalg.norm(response.forces, axis=0)).max())
 
 
 def _charges(lower: np.ndarray, upper: np.ndarray, distance: float) -> np.ndarray:
     """Return points at a distance from a box, in halves of its longest side, all around it, shape [s, 3]."""
+    sides = (upper - lower) / (0.5 * (upper - lower).max()) + 2.0 * distance
+    return _shell(lower, upper, distance, [1 + math.ceil(side / (_SOURCE_SPACING * distance)) for side in sides])
+
+
+def _ball_places(lower: np.ndarray, upper: np.ndarray, distance: float) -> np.ndarray:
+    """Return points at a distance from the centers of faces and edges of a box and from its corners."""
+    return _shell(lower, upper, distance, [3, 3, 3])
+
+
+def _shell(lower: np.ndarray, upper: np.ndarray, distance: float, counts: list[int]) -> np.ndarray:
+    """Return points at a distance from a box, from the surface of a grid of ``counts`` points around it."""
     distance = distance * 0.5 * (upper - lower).max()
     sides = upper - lower + 2.0 * distance
-    grid = [np.linspace(-0.5, 0.5, 1 + math.ceil(side / (_SOURCE_SPACING * distance))) * side for side in sides]
+    grid = [np.linspace(-0.5, 0.5, count) * side for count, side in zip(counts, sides, strict=True)]
     points = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, 3)
     points = 0.5 * (lower + upper) + points[(np.abs(points) > 0.499 * sides).any(axis=1)]
     nearest = np.clip(points, lower, upper)
@@ -198,7 +240,10 @@ def _basis(fields: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _parts(positions: np.ndarray, most: int) -> np.ndarray:
-    """Return a number for each cell: that of its box in a grid of at most ``most`` boxes, nearly cubes."""
+    """Return a number for each cell: that of its group in a grid of at most ``most`` groups.
+
+    Groups at the ends of the grid are narrower.
+    """
     lower, sides = positions.min(axis=0), np.ptp(positions, axis=0)
     sides = np.maximum(sides, 1e-6 * sides.max())
     spacing, counts = sides.max(), np.ones(3, int)
@@ -208,9 +253,16 @@ def _parts(positions: np.ndarray, most: int) -> np.ndarray:
         if finer.prod() > most:
             break
         counts = finer
-    index = np.minimum(((positions - lower) / sides * counts).astype(int), counts - 1)
-    _, part = np.unique(np.ravel_multi_index(tuple(index.T), tuple(counts)), return_inverse=True)
+    places = ((positions - lower) / sides).T
+    index = [np.searchsorted(_ends(count), x, side="right") for count, x in zip(counts, places, strict=True)]
+    _, part = np.unique(np.ravel_multi_index(tuple(index), tuple(counts)), return_inverse=True)
     return part.reshape(-1)
+
+
+def _ends(count: int) -> np.ndarray:
+    """Return the places in 0 … 1 between ``count`` groups of cells."""
+    equal = np.arange(1, count) / count
+    return equal + _EDGE_WEIGHT * (0.5 - 0.5 * np.cos(np.pi * equal) - equal)
 
 
 def _solve(body, coupling: Coupling, fields: np.ndarray) -> np.ndarray:
