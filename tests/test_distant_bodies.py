@@ -96,10 +96,10 @@ def force(points, moments, source, moment):
 @pytest.mark.parametrize(
     ("solid", "spacing", "count"),
     [
-        (lattice.box(PLATE), 0.003, 4),
-        (lattice.box([0.01] * 3), 0.0032, 4),
+        (lattice.box(PLATE), 0.003, 3),
+        (lattice.box([0.01] * 3), 0.0032, 3),
         (lattice.cylinder(0.002, 0.03), 0.0015, 2),
-        (lattice.box(PLATE), 0.006, 3),
+        (lattice.box(PLATE), 0.006, 2),
     ],
     ids=["plate", "cube", "rod", "coarse plate"],
 )
@@ -159,11 +159,12 @@ def test_forces_along_a_path_have_no_jump_and_equal_those_of_cells(device, monke
         # few moments differ less from cells than a jump may be; cells by the tolerance of two solves
         for columns in (slice(3), slice(3, 6)):
             scale = np.abs(expected[:, columns]).max()
-            assert np.abs(actual - expected)[:, columns].max() < (5e-3 if seen[-1] < 4 else 2e-3) * scale
-        assert relative(magnetics.shape_moments()[0], cells.shape_moments()[0]) < 5e-3
+            assert np.abs(actual - expected)[:, columns].max() < (5e-3 if seen[-1] < 3 else 2e-3) * scale
+        # moments are chosen by the errors of forces, up to BALL_ERROR; those of the total moment are of that order
+        assert relative(magnetics.shape_moments()[0], cells.shape_moments()[0]) < 1e-2
         np.testing.assert_allclose(actual[:, :3].sum(axis=0), 0.0, atol=1e-5 * np.abs(actual).max())
     # each switch is at the reach on the way in, and at 1.1 times it on the way out
-    assert seen == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 4, 3, 3, 2, 2, 1, 1, 0, 0]
+    assert seen == [0, 0, 1, 1, 2, 2, 3, 3, 3, 2, 2, 1, 1, 0, 0]
 
 
 @pytest.mark.long
@@ -192,7 +193,7 @@ def test_a_passing_magnet_keeps_its_energy(device):
         seen.append(int(levels(magnetics)[0]))
         position = position + dt * velocity + 0.5 * dt**2 * acceleration
         position[2], velocity[2] = 0.012, 0.0  # a rail
-    assert seen[0] == seen[-1] == 0 and {*seen} == {0, 1, 2, 3, 4}
+    assert seen[0] == seen[-1] == 0 and {*seen} == {0, 1, 2, 3}
     assert max(energies) > 1.01 * energies[0]
     assert abs(energies[-1] - energies[0]) < 1e-3 * (max(energies) - energies[0])
 
@@ -232,7 +233,7 @@ def test_a_captured_step_switches(device):
         state.clear_forces()
         wp.capture_launch(capture.graph)
         forces = state.body_f.numpy()
-        assert levels(magnetics)[0] == (0 if gap > 0.1 else 4)
+        assert levels(magnetics)[0] == (0 if gap > 0.1 else 3)
         assert relative(forces, wrenches(warpmag.Magnetics(model), state)) < 2e-3
 
 

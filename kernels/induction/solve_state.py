@@ -13,12 +13,12 @@ from warpmag.kernels.pairs.neighbors import CAPACITY
 from warpmag.kernels.shared.copies import put_copies, repeat_rows
 from warpmag.kernels.shared.native import CHUNK, LINE
 from warpmag.kernels.shared.pieces import cut
-from warpmag.kernels.shared.reductions import block_max, block_sum, fence
+from warpmag.kernels.shared.reductions import block_max, fence
 
 DEPTH = 5  # changes between iterates that are stored and mixed (``anderson.h``)
 COLUMNS = 10 + DEPTH + DEPTH * (DEPTH + 1) // 2  # sums over the moments of a chunk or world; as in ``theta_step.h``
 BLOCK_CHUNK = 128  # moments in a chunk on a GPU, one per thread of a block; on a CPU a chunk has ``native.CHUNK``
-_CHUNK_SIZES = 4, 32, BLOCK_CHUNK
+_CHUNK_SIZES = 4, 32, 64, BLOCK_CHUNK
 """Sizes for which the blocks of a GPU are made. Blocks for whole chunks would be mostly idle in small worlds."""
 
 
@@ -246,13 +246,17 @@ def is_last_of_world(lane: int, w: int, chunks: int, arrived: wp.array[int]):
 def world_summation(dtype, columns: int):
     """Return the Warp function with which the last block of a world adds up the world's sums.
 
-    Every thread passes its terms. The first thread of the last block gets (True, totals), all others False.
+    Kernels that call it include ``shared/block_sum.h``. Every thread passes its terms. The first thread of the last
+    block gets (True, totals), all others False.
     """
     vector = wp.types.vector(columns, wp.float64)
 
+    @wp.func_native("return warpmag::block_sum(value);")
+    def sum_block(value: vector) -> vector: ...
+
     @wp.func
     def sum_world(terms: vector, c: int, lane: int, w: int, state: state_type(dtype)):
-        total = block_sum(terms)
+        total = sum_block(terms)
         begin = state.chunk_begin[w]
         end = state.chunk_begin[w + 1]
         if end - begin == 1:
@@ -266,7 +270,7 @@ def world_summation(dtype, columns: int):
         for chunk in range(begin + lane, end, wp.block_dim()):
             for column in range(wp.static(columns)):
                 rest[column] += state.sums[chunk, column]
-        return lane == 0, block_sum(rest)
+        return lane == 0, sum_block(rest)
 
     return sum_world
 

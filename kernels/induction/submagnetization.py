@@ -88,7 +88,8 @@ def step_submagnetization(u: Any, h_eff: Any, kappa: Any, precession: Any, side:
 
 
 def _options(dtype) -> dict:
-    return native_options("induction/solve_state.h", "material/curves.h", dtype=dtype)
+    headers = "induction/solve_state.h", "material/curves.h", "shared/block_sum.h"
+    return native_options(*headers, dtype=dtype)
 
 
 @cache

@@ -162,7 +162,9 @@ def _measure_kernel(dtype):
     def wide(v: wp.types.vector(3, dtype)):
         return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
 
-    @wp.kernel(module="unique", enable_backward=False)
+    options = native_options("shared/block_sum.h", dtype=dtype)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=options)
     def measure(state: state_struct, arrays: arrays_type):
         c, lane = wp.tid()
         chunk = state.chunk[c]

@@ -10,6 +10,7 @@
 #include "material/curves.h"
 #include "pairs/neighbor_lists.h"
 #include "shared/active.h"
+#include "shared/block_sum.h"
 #include "shared/group.h"
 #include "shared/team.h"
 

@@ -39,7 +39,7 @@ LOOP, FUSED, SHORT, MIRRORED, REFERENCE, GIVEN = "loop", "fused", "short", "mirr
 _MOST_FUSED = {Quantity.FIELD: 7000, Quantity.FORCE: 2640, Quantity.MUTUAL_FORCE: 2640, Quantity.WRENCH: 2640}
 _LEAST_MIRRORED = {Quantity.FIELD: 5281, Quantity.MUTUAL_FORCE: 2641}
 _LEAST_MUTUAL = 0.75  # least fraction of the sources that are targets, for which the mirrored form is faster
-_MOST_SHORT = 48, 256
+_MOST_SHORT = 160, 256
 """Most targets and most sources of a segment with the form ``SHORT``. A tile of the loop has 96 to 256 targets, most of
 which would be copies."""
 _FEWEST_PAIRS_OF_RANKS = {"cpu": 800_000, "cuda": 1_000_000_000}

@@ -69,11 +69,13 @@ CUDA_CALLABLE inline SharedVolumes shared_volumes(const Lists& lists, int i, int
     const Number radius = row(3, self);
     SharedVolumes sums = {Number(Real(0)), Number(Real(0))};
     auto add = [&](auto j, Mask listed) {
+        const Mask accepted = listed & accepts(self, Index(j));
+        if (!any(accepted)) return;
         const Vector r = {x.x - row(0, j), x.y - row(1, j), x.z - row(2, j)};
         const Number other_radius = row(3, j), contact = radius + other_radius;
-        const Mask overlapping = listed & (dot(r, r) < contact * contact);
+        const Mask overlapping = accepted & (dot(r, r) < contact * contact);
         if (!any(overlapping)) return;
-        const Number volume = shared_volume(dot(r, r), radius, other_radius, overlapping & accepts(self, Index(j)));
+        const Number volume = shared_volume(dot(r, r), radius, other_radius, overlapping);
         const Number ratio = overlapping ? other_radius / radius : Number(Real(1));
         sums.over_mean += volume;
         sums.over_own += volume * ratio * root(ratio);

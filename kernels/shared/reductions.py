@@ -40,12 +40,6 @@ def group_sum(vector):
 
 
 @wp.func
-def block_sum(value: Any):
-    """Sum of a value over the threads of a block, in a fixed order; all threads get the same sum."""
-    return wp.tile_extract(wp.tile_sum(wp.tile(value, preserve_type=True)), 0)
-
-
-@wp.func
 def block_max(value: Any):
     """Largest value among the threads of a block."""
     return wp.tile_extract(wp.tile_max(wp.tile(value)), 0)

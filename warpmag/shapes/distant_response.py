@@ -15,7 +15,7 @@ point is the centroid of a group of cells. The groups are narrower near the ends
 There are several levels, :data:`FAR_TO_NEAR`: the nearer the surface, the more combinations and points. The number of
 points follows from the forces on ball magnets around the body, which act as dipoles. The diameter of each ball equals
 its distance from the body. A level has the fewest points with which the largest error of these forces, over several
-places and directions, is at most :attr:`Level.error` at its smallest distance. If no number of points suffices, the
+places and directions, is at most :data:`BALL_ERROR` at its smallest distance. If no number of points suffices, the
 distance is larger instead, because the error falls with the third power of the distance or faster. The median error is
 a fifth of the largest.
 """
@@ -28,17 +28,11 @@ import numpy as np
 from warpmag.shapes.demagnetization import Coupling, full_tensors, pair_law_tensors
 from warpmag.shapes.uniform_response import cell_matrix
 
-
-@dataclass(frozen=True)
-class Level:
-    """Smallest distance of a level, which is that of the surface of charges, and the error there."""
-
-    distance: float  # from the body's box, in halves of its longest side
-    error: float  # largest relative error of the force of a ball magnet whose diameter is this distance
-
-
-FAR_TO_NEAR = Level(3.0, 0.005), Level(1.2, 0.01), Level(0.6, 0.01), Level(0.3, 0.02)
-"""Levels of distances. Far away a few more moments cost little, so errors are smaller there."""
+FAR_TO_NEAR = 1.2, 0.6, 0.3
+"""Smallest distance of each level from the body's box, which is that of the surface of charges, in halves of the
+longest side of the box."""
+BALL_ERROR = 0.025
+"""Largest relative error of the force of a ball magnet at the smallest distance of a level."""
 POINT_COUNTS = 8, 9, 12, 16, 20, 25, 36, 49, 64, 81, 100, 125, 144, 196
 """Largest numbers of points that are tried at a level."""
 LEAST_REPLACED_CELLS = 65
@@ -110,7 +104,7 @@ def distant_bodies(body, coupling: Coupling) -> list[DistantBody] | None:
 class _Response:
     """Fields of sources at the distance of a level, and the response of the cells, both times the roots of volumes."""
 
-    level: Level
+    distance: float  # in halves of the longest side of the body's box
     charges: np.ndarray  # places of the charges, shape [s, 3]
     combinations: np.ndarray  # of their fields, shape [s, p]
     fields: np.ndarray  # these combinations at the cells, shape [3 n, p]
@@ -122,16 +116,16 @@ class _Response:
 def _responses(body, coupling: Coupling) -> list[_Response]:
     """Return the fields and the responses of the cells at all levels."""
     box = _box(body)
-    charges = [_charges(*box, level.distance) for level in FAR_TO_NEAR]
-    balls = [_ball_places(*box, 1.5 * level.distance) for level in FAR_TO_NEAR]
+    charges = [_charges(*box, distance) for distance in FAR_TO_NEAR]
+    balls = [_ball_places(*box, 1.5 * distance) for distance in FAR_TO_NEAR]
     bases = [_basis(_scaled_fields(body.positions, body.volumes, x)) for x in charges]
     tests = [_Tests.at(x, body.positions, body.volumes) for x in balls]
     fields = [fields for (cells, _), test in zip(bases, tests, strict=True) for fields in (cells, test.fields)]
     ends = np.cumsum([field.shape[1] for field in fields])[:-1]
     responses = np.split(_solve(body, coupling, np.hstack(fields)), ends, axis=1)
     return [
-        _Response(level, places, combinations, cells, patterns, ball, test.forces(magnetized))
-        for level, places, (cells, combinations), patterns, ball, test, magnetized in zip(
+        _Response(distance, places, combinations, cells, patterns, ball, test.forces(magnetized))
+        for distance, places, (cells, combinations), patterns, ball, test, magnetized in zip(
             FAR_TO_NEAR, charges, bases, responses[::2], balls, tests, responses[1::2], strict=True
         )
     ]
@@ -164,13 +158,12 @@ class _Tests:
 
 
 def _fewest_moments(body, response: _Response) -> DistantBody:
-    """Return the fewest moments with the error of a level, or the most that are tried, with a larger distance."""
-    allowed = response.level.error
+    """Return the fewest moments with an error of at most :data:`BALL_ERROR`, or the most that are tried."""
     for count in (count for count in POINT_COUNTS if count < len(body.volumes)):
         few, error = _few_moments(body, response, count)
-        if error <= allowed:
+        if error <= BALL_ERROR:
             break
-    return replace(few, reach=few.reach * max(1.0, float(np.cbrt(error / allowed))))
+    return replace(few, reach=few.reach * max(1.0, float(np.cbrt(error / BALL_ERROR))))
 
 
 def _few_moments(body, response: _Response, count: int) -> tuple[DistantBody, float]:
@@ -196,7 +189,7 @@ def _few_moments(body, response: _Response, count: int) -> tuple[DistantBody, fl
     few = DistantBody(
         _coupling(points, shares, inverse_response / (root[:, None] * root)), shares, lower, upper,
         coefficients=inverse @ inverse_response / root, patterns=patterns.transpose(1, 2, 0).copy(),
-        reach=response.level.distance * 0.5 * float((upper - lower).max()),
+        reach=response.distance * 0.5 * float((upper - lower).max()),
     )  # fmt: skip
     return few, float((errors / np.linalg.norm(response.forces, axis=0)).max())
 
