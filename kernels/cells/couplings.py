@@ -17,9 +17,6 @@ from warpmag.kernels.shared.team import launch_passes, threads_for
 
 DIFFERENCES, UNIFORM_FIELD, TRANSPOSE, ADD = range(4)  # the passes, in order; as in ``couplings.h``
 _CELLS_PER_THREAD = 500  # cells per thread of a CPU, at least
-_FEW_THREADS, _MANY_CELLS = 2, 50_000
-"""Threads of a GPU per cell if the cells alone fill the GPU, and the smallest number of such cells. With few threads
-per cell, reads of neighboring entries of the table coalesce."""
 
 
 @cache
@@ -143,7 +140,7 @@ class CellCouplings:
     @staticmethod
     def _record(couplings, first: int, last: int):
         device, rows = couplings.h.device, CHUNK * couplings.chunk.shape[0]
-        group = _FEW_THREADS if device.is_cuda and rows >= _MANY_CELLS else group_threads(device)
+        group = group_threads(device, moments=rows)
         sizes = dict(threads=threads_for(rows, _CELLS_PER_THREAD), gpu_threads=group * rows)
         sizes["max_blocks"] = most_blocks(device) if couplings.active else 0
         kernel = _kernel(couplings.tensor.dtype, group)

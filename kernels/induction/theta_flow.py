@@ -220,7 +220,7 @@ class Launches:
     def __init__(self, state):
         """Record the launches for a state bound to its moments (``solve_state.bind``)."""
         device, dtype, count, chunks = state.h.device, state.packed.dtype, state.row.shape[0], state.chunk.shape[0]
-        group = group_threads(device)
+        group = group_threads(device, moments=count)
 
         def record(kernel, dim, *inputs, block_dim=256, max_blocks=0):
             options = dict(block_dim=block_dim, max_blocks=max_blocks, device=device, record_cmd=True)
@@ -236,7 +236,7 @@ class Launches:
         else:
             largest = state.block_moments
             blocks, block_dim = -(-group * largest // _START_THREADS), max(32, largest)
-            width, begin = group * largest // blocks, _begin_kernel(dtype, group, blocks)
+            width, begin = max(32, group * largest // blocks), _begin_kernel(dtype, group, blocks)
             self.begin = [record(begin, (blocks * chunks, width), block_dim=width)]
             most = most_blocks(device) if state.active else 0
             sweep = _sweep_kernel(dtype, group)

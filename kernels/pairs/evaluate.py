@@ -132,8 +132,9 @@ class PairEvaluation:
             self._launch_sums = lambda a: _launch_fused(finished, shape, a)
             return 0, work_list.block_tiles(segments, shape.targets)
         if self.form == SHORT:
-            kernel = _short_kernel(targets.dtype, finished, group_threads(device))
-            self._launch_sums = lambda _: self._launch_pass(kernel, 1)
+            group = group_threads(device)
+            kernel = _short_kernel(targets.dtype, finished, group)
+            self._launch_sums = lambda _: self._launch_pass(kernel, 1, group)
             return 0, ()
         if device.is_cuda:
             shape = sums_cuda.choose_loop_shape(finished, count)
@@ -150,7 +151,7 @@ class PairEvaluation:
             tiles, shares = work_list.tiles_of_rank(tiles, shares, self._ranks)
         self._arrays.shares = wp.array(shares, dtype=wp.int32, device=device)
         pair_loop = _cpu_loop_kernel(targets.dtype, quantity)
-        self._launch_sums = lambda _: self._launch_pass(pair_loop, threads)
+        self._launch_sums = lambda _: self._launch_pass(pair_loop, threads, 1)
         return parts, tiles
 
     def launch(self, wait=None):
@@ -165,20 +166,24 @@ class PairEvaluation:
         if wait is not None:
             wait()
         if self.form not in (FUSED, SHORT):
-            finish = _finish_kernel(self.partial.dtype, self._finished, group_threads(self.partial.device))
+            group = group_threads(self.partial.device, moments=self.count)
+            finish = _finish_kernel(self.partial.dtype, self._finished, group)
             # the threads that summed are awake, and a row whose overlap list is full visits all its sources
-            self._launch_pass(finish, threads_for(self.pair_count, PAIRS_PER_THREAD))
+            self._launch_pass(finish, threads_for(self.pair_count, PAIRS_PER_THREAD), group)
 
     def finish_active(self, active):
         """Finish only the rows in ``active`` from now on, on a GPU: their number, then the rows, shape [count + 1]."""
         self._arrays.active = active
         self._recorded.clear()
 
-    def _launch_pass(self, kernel, threads):
-        """Launch a pass over the target rows. The launch is recorded, so that the struct is packed only once."""
+    def _launch_pass(self, kernel, threads, group):
+        """Launch a pass over the target rows, with ``group`` threads a row on a GPU.
+
+        The launch is recorded, so that the struct is packed only once.
+        """
         if kernel not in self._recorded:
             device = self.partial.device
-            sizes = dict(threads=threads, gpu_threads=group_threads(device) * self.count)
+            sizes = dict(threads=threads, gpu_threads=group * self.count)
             sizes["max_blocks"] = most_blocks(device) if self._arrays.active else 0
             self._recorded[kernel] = launch_passes(kernel, 0, 1, self._arrays, device=device, record_cmd=True, **sizes)
         self._recorded[kernel].launch()

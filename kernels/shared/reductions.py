@@ -6,14 +6,22 @@ from typing import Any
 import warp as wp
 
 _GROUP_THREADS = 8  # threads of a GPU that share the neighbors of a moment; a power of two, at most a warp
+_FEW_THREADS, _MANY_MOMENTS = 2, 50_000
+"""Threads of a GPU per moment if the moments alone fill the GPU, and the smallest number of such moments. With few
+threads per moment, reads of neighboring entries coalesce, and fewer threads wait."""
 _WARP = 32  # threads of a warp, which share the thousands of neighbors of a large cell among small ones
 
 _BLOCKS = 16  # per multiprocessor of a GPU, in launches over lists
 
 
-def group_threads(device, *, long_lists: bool = False) -> int:
-    """Number of threads that share the neighbors of a moment: 1 on a CPU, on a GPU 8, or a warp for long lists."""
-    return (_WARP if long_lists else _GROUP_THREADS) if device.is_cuda else 1
+def group_threads(device, *, moments: int = 0, long_lists: bool = False) -> int:
+    """Number of threads that share the neighbors of a moment: 1 on a CPU, on a GPU 8, or a warp for long lists.
+
+    It is 2 where a pass has many ``moments``.
+    """
+    if not device.is_cuda:
+        return 1
+    return _WARP if long_lists else _FEW_THREADS if moments >= _MANY_MOMENTS else _GROUP_THREADS
 
 
 def most_blocks(device) -> int:
