@@ -6,7 +6,7 @@ May import ``shared``, ``material``, ``pairs`` and ``cells``.
 |---|---|
 | solve_state | state of a solve for every dynamics, worlds, convergence |
 | theta_flow | accelerated θ flow, the default dynamics |
-| body_steps | steps of bodies of cells as a whole |
+| body_products | fields and steps of bodies of cells as a whole |
 | submagnetization | baseline dynamics by pairs of submagnetizations |
 | energy | energy in equilibrium |
 | tangent | linear solve at an equilibrium, for gradients |

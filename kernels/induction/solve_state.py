@@ -37,7 +37,7 @@ class World:
     used: int  # number of changes that the next step mixes
     is_best: int  # 1 if the last iterate is the best so far
     plain_steps: int  # steps left without mixing
-    apart: int  # solves left without sweeps and steps of bodies as a whole (``body_steps``), since one was rejected
+    apart: int  # solves left without sweeps and steps of bodies as a whole (``body_products``), since one was rejected
     ahead: wp.float64  # factor η of the last change from solve to solve in the next start
     best: wp.float64  # smallest merit of this solve, negative before the first evaluation
     alpha: wp.types.vector(DEPTH, wp.float64)  # Anderson coefficients

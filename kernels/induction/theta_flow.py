@@ -14,7 +14,7 @@ moments does not dominate. The plain step is mirror descent on the energy divide
 is convex for the ball-averaged kernel. Let L_i = 1 + k (2/3 + o_i + f_i), with o_i the volumes that a ball shares with
 others, over the roots of the products of both volumes (``stiffness_of`` in ``theta_flow.h``). The energy decreases from
 any state for ω_i ≤ 1/L_i, and near the solution the steps converge for ω_i < 2/L_i. Cells of bodies that take steps as
-a whole (``body_steps.py``) have a demagnetizing factor f_i of overlaps, others have f_i = 0.
+a whole (``body_products.py``) have a demagnetizing factor f_i of overlaps, others have f_i = 0.
 
 Let a mixture be a vector s̄. After as many evaluations as stored changes, the newest stored change is replaced if the
 current iterate is the best so far. The new one is the difference between the current s̄ and the previous s̄. The
@@ -43,11 +43,11 @@ with λ = ‖φ (2 − ω₁) r‖/‖φ r‖. In long solves λ is replaced by 
 Inside a body of iron, closed loops of magnetization have almost no field. They barely change the residual, and do not
 affect forces or fields outside. So in worlds with bodies of cells the error is measured in the energy norm. Let A =
 max(1, …) be the amplification above, b = k H0/Ms the reduced applied field, and H' the field H plus the changes of
-``body_steps.py``:
+``body_products.py``:
 
     error = max(‖M − f(H)‖/‖f(H)‖, √(A ⟨M − f(H), M − f(H')⟩/⟨φ s, φ b⟩)).
 
-The energy norm of an error e is √⟨e, r⟩. For bodies that take steps as a whole (``body_steps.py``), r' = Q r
+The energy norm of an error e is √⟨e, r⟩. For bodies that take steps as a whole (``body_products.py``), r' = Q r
 approximates e. For other bodies M − f(H) and M − f(H') are equal. The energy norm of the solution is √⟨s, b⟩. In a long
 bar along the field a slow mode dominates the solution, and the error is the same in both norms. A steel plate of
 60 × 60 × 3 mm that a magnet lifts takes 2 evaluations per solve. Ending these solves at ``rtol`` contributes an error

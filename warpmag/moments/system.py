@@ -33,7 +33,7 @@ from warpmag.moments.arrays import (
     shape_message,
     vec3_type,
 )
-from warpmag.moments.body_steps import make_body_steps
+from warpmag.moments.body_products import make_body_fields, make_body_steps
 from warpmag.moments.dynamics import make_dynamics
 from warpmag.moments.fmm import SystemSums, fast_sums_for
 from warpmag.moments.force_sums import force_sums
@@ -168,7 +168,11 @@ class MomentSystem:
         limits = float(settings.rtol), int(settings.max_evaluations)
         solve_state.bind(self._induction, self._packed, self.material, self.moments, *limits)
         bodies = () if self._cells is None else self._cells.bodies
-        self._body_steps = make_body_steps(bodies, layout, self.rotations, self._induction, settings.dynamics)
+        arguments = bodies, layout, self.rotations, self._induction
+        self._body_steps = make_body_steps(*arguments, settings.dynamics)
+        self._body_fields = None
+        if settings.dynamics == "theta" and not (near or self.is_fast or self._ranks):
+            self._body_fields = make_body_fields(*arguments)
         self.dynamics = make_dynamics(settings.dynamics, self._induction, step=settings.step, damping=settings.damping)
 
     def _allocate(self, layout: MomentLayout, external_field):
@@ -423,7 +427,7 @@ class MomentSystem:
     def iterate(self):
         """Launch one field evaluation at the inducible moments and one step of the dynamics."""
         self.dynamics.refine()
-        self._sum_field()
+        self._sum_field(everywhere=False)
         if self._body_steps is not None:
             self._body_steps.launch()
         self.dynamics.iterate()
@@ -442,7 +446,7 @@ class MomentSystem:
 
     def evaluate(self):
         """Launch one evaluation of ``h`` at the inducible moments, without a step."""
-        self._sum_field()
+        self._sum_field(everywhere=True)
         self._wait_for_near_contacts()
 
     def evaluate_again(self):
@@ -451,8 +455,14 @@ class MomentSystem:
         if self._inducible_field.count:
             self.evaluate()
 
-    def _sum_field(self):
-        """Launch all sums of the field at inducible moments; :meth:`_wait_for_near_contacts` must follow."""
+    def _sum_field(self, *, everywhere: bool):
+        """Launch all sums of the field at inducible moments; :meth:`_wait_for_near_contacts` must follow.
+
+        With ``everywhere`` False some sums leave out worlds that have converged.
+        """
+        if self._body_fields is not None:
+            self._body_fields.launch(everywhere=everywhere)
+            return
         near = self._near
         if near is None:
             self._inducible_field.launch()

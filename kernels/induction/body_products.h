@@ -1,12 +1,13 @@
-// Steps of bodies as a whole: the residuals r of a body's cells become r + w (Q − 1) r; body_steps.py has the
-// equations.
+// Products with operators of bodies: the fields of a body's own moments, and steps of bodies as a whole.
+// body_products.py has the equations.
 //
-// Q acts on parities of the mirrored body separately (``warpmag.shapes.body_response``). FOLD writes the parts of the
-// residuals of each parity, in the frames of the bodies, and WRITE_WEIGHTS the weight w of each body. MULTIPLY
-// multiplies each part by its table Q − 1. UNFOLD adds the result to the field. Bodies with the same tables form groups
-// of at most ``MEMBERS``, so that a GPU reads a table once for several bodies; a CPU, whose caches hold the tables, has
+// The operators act on parities of the mirrored body separately (``warpmag.shapes.body_response``). FOLD writes the
+// parts of the residuals of each parity, in the frames of the bodies, and WRITE_WEIGHTS the weight w of each body.
+// MULTIPLY multiplies each part by its table Q − 1. UNFOLD adds the result to the field. FOLD_MOMENTS, MULTIPLY_FIELD
+// and UNFOLD_FIELD add the field T m to the applied field in the same way. Bodies with the same tables form groups of
+// at most ``MEMBERS``, so that a GPU reads a table once for several bodies; a CPU, whose caches hold the tables, has
 // groups of one. On a CPU a pass works on a vector of orbits, on a GPU ``GROUP`` threads multiply for one orbit.
-// ``BodySteps`` is the struct of body_steps.py.
+// ``Steps`` is the struct of body_products.py.
 #pragma once
 #include "cells/rotation.h"
 #include "induction/spans.h"
@@ -18,11 +19,15 @@ namespace warpmag {
 constexpr int ENTRY = 9 * CHUNK; // words of a table for a pair of sources and CHUNK targets
 constexpr int MIRRORS = 8;       // sets of mirrors across x, y and z
 
-enum BodyPass { FOLD, WRITE_WEIGHTS, MULTIPLY, UNFOLD }; // as in body_steps.py
+enum BodyPass { FOLD, WRITE_WEIGHTS, MULTIPLY, UNFOLD, FOLD_MOMENTS, MULTIPLY_FIELD, UNFOLD_FIELD }; // as in Python
 
+// Whether a world takes no steps, or needs no field.
 template <class Steps> CUDA_CALLABLE inline bool skips_steps(const Steps& steps, int world) {
     const auto& solve = steps.state.worlds.data[world];
     return solve.active == 0 || solve.apart > 0;
+}
+template <class Steps> CUDA_CALLABLE inline bool skips_field(const Steps& steps, int world) {
+    return steps.state.resting.data[world] != 0 || (!steps.everywhere && steps.state.worlds.data[world].active == 0);
 }
 template <class Steps> CUDA_CALLABLE inline Rotation<Real> rotation_of_body(const Steps& steps, int body) {
     return rotation_of<Real>(steps.rotation.data[steps.body.data[body][2]]);
@@ -84,11 +89,13 @@ template <class Visit> CUDA_CALLABLE inline void visit_parities(const Orbits& at
     }
 }
 
-// Writes the parts of k H/Ms − s at the orbits of a body from ``offset`` on: for each orbit x, y and z of all members
-// of the body's group side by side. A component changes its sign by the mirror across its axis.
-template <class Steps> CUDA_CALLABLE inline void fold(const Steps& steps, int body, int offset) {
+// Writes the parts of values at the orbits of a body from ``offset`` on: for each orbit x, y and z of all members of
+// the body's group side by side. A component changes its sign by the mirror across its axis. ``value(i)`` returns the
+// values of moments i in the world.
+template <class Steps, class Value>
+CUDA_CALLABLE inline void fold(const Steps& steps, int body, int offset, bool skips, Value value) {
     const Orbits at = orbits_at(steps, body, offset);
-    if (share() != 0 || at.count == 0 || skips_steps(steps, steps.body.data[body][3])) return;
+    if (share() != 0 || at.count == 0 || skips) return;
     const Rotation<Real> rotation = rotation_of_body(steps, body);
     Vector v[MIRRORS];
     Real scale = 1;
@@ -97,9 +104,7 @@ template <class Steps> CUDA_CALLABLE inline void fold(const Steps& steps, int bo
     for (int g = 0; g < MIRRORS; ++g) {
         if (g & ~at.mirrors) continue;
         const Index signed_moment = images_at(steps, at, g);
-        const Index i = signed_moment < 0 ? -1 - signed_moment : signed_moment;
-        const Number factor = collect(steps.state.slope.data, i) / collect(steps.state.saturation.data, i);
-        v[g] = scale * to_body(rotation, factor * vectors_of(steps.state.h, i) - vectors_of(steps.state.s, i));
+        v[g] = scale * to_body(rotation, value(signed_moment < 0 ? -1 - signed_moment : signed_moment));
     }
     transform(v, at.mirrors);
     Real* const out = steps.residual.data + body % MEMBERS;
@@ -111,11 +116,12 @@ template <class Steps> CUDA_CALLABLE inline void fold(const Steps& steps, int bo
         }
     });
 }
-
-// Adds the changes of the field at the orbits of a body from ``offset`` on.
-template <class Steps> CUDA_CALLABLE inline void unfold(const Steps& steps, int body, int offset) {
+// Calls put(i, moment, product, count) with the products at the orbits of a body from ``offset`` on, in the world, for
+// each set of mirrors: ``count`` moments i, where ``moment`` is negative for moments that occur before.
+template <class Steps, class Put>
+CUDA_CALLABLE inline void unfold(const Steps& steps, int body, int offset, bool skips, Put put) {
     const Orbits at = orbits_at(steps, body, offset);
-    if (share() != 0 || at.count == 0 || skips_steps(steps, steps.body.data[body][3])) return;
+    if (share() != 0 || at.count == 0 || skips) return;
     const Real* const parts = steps.response.data + body % MEMBERS;
     Vector v[MIRRORS];
     visit_parities(at, [&](int p, size_t first) {
@@ -130,19 +136,48 @@ template <class Steps> CUDA_CALLABLE inline void unfold(const Steps& steps, int 
     });
     transform(v, at.mirrors);
     const Rotation<Real> rotation = rotation_of_body(steps, body);
-    const Real weight = steps.weight.data[body];
 #pragma unroll
     for (int g = 0; g < MIRRORS; ++g) {
         if (g & ~at.mirrors) continue;
-        const Index moment = images_at(steps, at, g), i = moment < 0 ? at.moment : moment;
-        const Number scale = weight * collect(steps.state.saturation.data, i) / collect(steps.state.slope.data, i);
-        const Vector change = scale * to_world(rotation, v[g]), h = vectors_of(steps.state.h, i) + change;
-        for (int l = 0; l < at.count; ++l) {
-            if (lane_of(moment, l) < 0) continue;
-            put_lane(steps.state.h_change, lane_of(moment, l), change, l);
-            put_lane(steps.state.h, lane_of(moment, l), h, l);
-        }
+        const Index moment = images_at(steps, at, g);
+        put(moment < 0 ? Index(at.moment) : moment, moment, to_world(rotation, v[g]), at.count);
     }
+}
+// Puts vectors where ``moment`` is not negative.
+template <class Array> CUDA_CALLABLE inline void put_moments(const Array& array, Index moment, Vector v, int count) {
+    for (int l = 0; l < count; ++l)
+        if (lane_of(moment, l) >= 0) put_lane(array, lane_of(moment, l), v, l);
+}
+
+template <class Steps> CUDA_CALLABLE inline void fold_residuals(const Steps& steps, int body, int offset) {
+    const auto& state = steps.state;
+    fold(steps, body, offset, skips_steps(steps, steps.body.data[body][3]), [&](Index i) {
+        const Number factor = collect(state.slope.data, i) / collect(state.saturation.data, i);
+        return factor * vectors_of(state.h, i) - vectors_of(state.s, i);
+    });
+}
+// Adds the changes of the field.
+template <class Steps> CUDA_CALLABLE inline void unfold_steps(const Steps& steps, int body, int offset) {
+    const auto& state = steps.state;
+    const Real weight = steps.weight.data[body];
+    unfold(steps, body, offset, skips_steps(steps, steps.body.data[body][3]),
+           [&](Index i, Index moment, Vector product, int count) {
+               const Number scale = weight * collect(state.saturation.data, i) / collect(state.slope.data, i);
+               const Vector change = scale * product;
+               put_moments(state.h_change, moment, change, count);
+               put_moments(state.h, moment, vectors_of(state.h, i) + change, count);
+           });
+}
+template <class Steps> CUDA_CALLABLE inline void fold_moments(const Steps& steps, int body, int offset) {
+    fold(steps, body, offset, skips_field(steps, steps.body.data[body][3]),
+         [&](Index i) { return vectors_of(steps.state.moments, i); });
+}
+template <class Steps> CUDA_CALLABLE inline void unfold_field(const Steps& steps, int body, int offset) {
+    const auto& state = steps.state;
+    unfold(steps, body, offset, skips_field(steps, steps.body.data[body][3]),
+           [&](Index i, Index moment, Vector field, int count) {
+               put_moments(state.h, moment, vectors_of(state.h0, i) + field, count);
+           });
 }
 
 // Writes the weight of a body from the means of the shares d and the excesses e of its cells.
@@ -203,17 +238,47 @@ CUDA_CALLABLE inline void add_products(const Real* residuals, Vector (&sums)[MEM
     }
 }
 
-// Multiplies the part of a parity by its table, for the orbits from ``offset`` on.
-template <class Steps> CUDA_CALLABLE inline void multiply(const Steps& steps, int number, int offset) {
+// Orbits of a part from ``offset`` on: places of the parts in the arrays, their number, and that of the part's orbits;
+// ``table`` is the first entry for these orbits, with ``entries`` for each CHUNK of targets.
+struct PartRows {
+    size_t first;
+    int orbits, left, entry;
+};
+template <class Steps>
+CUDA_CALLABLE inline PartRows part_rows(const Steps& steps, int number, int offset, int entries) {
     const auto& part = steps.part.data[number]; // group of bodies, number of orbits, first entry of the table, place
-    bool any_active = false;
-    for (int body = MEMBERS * part[0]; body < MEMBERS * (part[0] + 1); ++body)
-        any_active |= steps.body.data[body][1] > 0 && !skips_steps(steps, steps.body.data[body][3]);
-    if (!any_active) return;
-    const size_t first = 3 * MEMBERS * (size_t)part[3];
-    const Real* const residuals = steps.residual.data + first;
-    const int chunk = offset / CHUNK, lane = offset % CHUNK, pairs = (part[1] + 1) / 2, left = part[1] - offset;
-    const int* const table = steps.table.data + (size_t)ENTRY * (part[2] + chunk * pairs) + lane;
+    const int left = part[1] - offset;
+    return {3 * MEMBERS * (size_t)part[3], part[1], left < WIDTH ? left : WIDTH, part[2] + offset / CHUNK * entries};
+}
+// Whether all bodies of a part skip it.
+template <class Steps, class Skips> CUDA_CALLABLE inline bool all_skip(const Steps& steps, int number, Skips skips) {
+    const int group = steps.part.data[number][0];
+    for (int body = MEMBERS * group; body < MEMBERS * (group + 1); ++body)
+        if (steps.body.data[body][1] > 0 && !skips(steps.body.data[body][3])) return false;
+    return true;
+}
+// Writes sums of the threads of a group.
+template <class Steps>
+CUDA_CALLABLE inline void put_products(const Steps& steps, const PartRows& at, int offset,
+                                       const Vector (&sums)[MEMBERS]) {
+    Real* const out = steps.response.data + at.first + 3 * MEMBERS * (size_t)offset;
+    for (int w = 0; w < MEMBERS; ++w) {
+        const Vector sum = group_sums(sums[w]);
+        if (share() != 0) continue;
+        for (int l = 0; l < at.left; ++l) {
+            Real* const to = out + 3 * MEMBERS * l + w;
+            to[0] = lane_of(sum.x, l), to[MEMBERS] = lane_of(sum.y, l), to[2 * MEMBERS] = lane_of(sum.z, l);
+        }
+    }
+}
+
+// Multiplies the part of a parity by its table of Q − 1, for the orbits from ``offset`` on.
+template <class Steps> CUDA_CALLABLE inline void multiply(const Steps& steps, int number, int offset) {
+    if (all_skip(steps, number, [&](int world) { return skips_steps(steps, world); })) return;
+    const int pairs = (steps.part.data[number][1] + 1) / 2;
+    const PartRows at = part_rows(steps, number, offset, pairs);
+    const Real* const residuals = steps.residual.data + at.first;
+    const int* const table = steps.table.data + (size_t)ENTRY * at.entry + offset % CHUNK;
     const Number zero = Number(Real(0));
     Vector sums[MEMBERS];
     for (int w = 0; w < MEMBERS; ++w) sums[w] = {zero, zero, zero};
@@ -226,36 +291,50 @@ template <class Steps> CUDA_CALLABLE inline void multiply(const Steps& steps, in
         add_products(pair_residuals, sums, [&](int k) { return lower_number(words[k]); });
         add_products(pair_residuals + 3 * MEMBERS, sums, [&](int k) { return upper_number(words[k]); });
     }
-    Real* const out = steps.response.data + first + 3 * MEMBERS * (size_t)offset;
-    for (int w = 0; w < MEMBERS; ++w) {
-        const Vector sum = group_sums(sums[w]);
-        if (share() != 0) continue;
-        for (int l = 0; l < (left < WIDTH ? left : WIDTH); ++l) {
-            Real* const to = out + 3 * MEMBERS * l + w;
-            to[0] = lane_of(sum.x, l), to[MEMBERS] = lane_of(sum.y, l), to[2 * MEMBERS] = lane_of(sum.z, l);
-        }
+    put_products(steps, at, offset, sums);
+}
+
+// Multiplies the part of a parity by its table of T, for the orbits from ``offset`` on.
+template <class Steps> CUDA_CALLABLE inline void multiply_field(const Steps& steps, int number, int offset) {
+    if (all_skip(steps, number, [&](int world) { return skips_field(steps, world); })) return;
+    const PartRows at = part_rows(steps, number, offset, steps.part.data[number][1]);
+    const Real* const moments = steps.residual.data + at.first;
+    const Real* const table = steps.tensors.data + (size_t)ENTRY * at.entry + offset % CHUNK;
+    const Number zero = Number(Real(0));
+    Vector sums[MEMBERS];
+    for (int w = 0; w < MEMBERS; ++w) sums[w] = {zero, zero, zero};
+#pragma unroll 2
+    for (int source = share(); source < at.orbits; source += SHARES) {
+        const Real* const entry = table + (size_t)ENTRY * source;
+        add_products(moments + 3 * MEMBERS * (size_t)source, sums, [&](int k) { return numbers(entry + k * CHUNK); });
     }
+    put_products(steps, at, offset, sums);
 }
 
 template <class Word, class Steps>
-CUDA_CALLABLE inline void add_body_steps(int thread, int first, int last, int threads, Word* team, const Steps& steps) {
+CUDA_CALLABLE inline void multiply_bodies(int thread, int first, int last, int threads, Word* team,
+                                          const Steps& steps) {
+    auto of_parts = [](int pass) { return pass == MULTIPLY || pass == MULTIPLY_FIELD; };
     auto make_pass = [&](int pass, int row) {
         if (pass == WRITE_WEIGHTS) {
             for (int body = row; body < row + WIDTH && body < steps.body.shape[0]; ++body) write_weight(steps, body);
             return;
         }
-        const auto& chunk = (pass == MULTIPLY ? steps.part_chunk : steps.body_chunk).data[row / CHUNK];
+        const auto& chunk = (of_parts(pass) ? steps.part_chunk : steps.body_chunk).data[row / CHUNK];
         const int offset = chunk[1] + row % CHUNK; // chunk: part or body, first orbit
-        if (pass == FOLD) fold(steps, chunk[0], offset);
+        if (pass == FOLD) fold_residuals(steps, chunk[0], offset);
         else if (pass == MULTIPLY) multiply(steps, chunk[0], offset);
-        else unfold(steps, chunk[0], offset);
+        else if (pass == UNFOLD) unfold_steps(steps, chunk[0], offset);
+        else if (pass == FOLD_MOMENTS) fold_moments(steps, chunk[0], offset);
+        else if (pass == MULTIPLY_FIELD) multiply_field(steps, chunk[0], offset);
+        else unfold_field(steps, chunk[0], offset);
     };
 #if defined(__CUDA_ARCH__)
     make_pass(first, thread / GROUP);
 #else
     auto items = [&](int pass) {
         if (pass == WRITE_WEIGHTS) return (int)steps.body.shape[0];
-        return CHUNK * (int)(pass == MULTIPLY ? steps.part_chunk : steps.body_chunk).shape[0];
+        return CHUNK * (int)(of_parts(pass) ? steps.part_chunk : steps.body_chunk).shape[0];
     };
     run_passes(team, threads, first, last, items, WIDTH, make_pass);
 #endif

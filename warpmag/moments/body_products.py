@@ -1,12 +1,12 @@
-"""Bodies of cells that take steps of the induction solve as a whole."""
+"""Bodies of cells that take steps of the induction solve as a whole, and fields of their own moments."""
 
 import numpy as np
 
-from warpmag.kernels.induction.body_steps import BodySteps
+from warpmag.kernels.induction.body_products import BodyFields, BodySteps
 from warpmag.kernels.shared.copies import put_copies
 from warpmag.moments.cached_shapes import shape_cache
 from warpmag.moments.layout import MomentLayout
-from warpmag.shapes.body_response import MOST_CELLS, BodyResponse, residual_response
+from warpmag.shapes.body_response import MOST_CELLS, BodyResponse, OwnField, own_field, residual_response
 from warpmag.shapes.demagnetization import Coupling
 
 _MOST_BYTES = 1 << 27
@@ -49,6 +49,38 @@ def _responses(couplings: dict[int, Coupling]) -> dict[int, BodyResponse]:
 
 def _response(coupling: Coupling) -> BodyResponse:
     """Return the response of a body, from the cache of shapes or computed."""
-    key = "response by parity", coupling.positions, coupling.radii, coupling.start, coupling.other
-    key = (*key, coupling.grid_tensor, coupling.grid_rotation, coupling.common)
+    key = "response by parity", *_operator_key(coupling)
     return shape_cache().get(f"response of {len(coupling.radii)} cells", key, lambda: residual_response(coupling))
+
+
+def make_body_fields(couplings, layout: MomentLayout, rotations, state) -> BodyFields | None:
+    """Prepare the fields of bodies; None unless the inducible moments of each world are one body with small tables.
+
+    ``couplings`` are those of :func:`make_body_steps`.
+    """
+    couplings = [(number, *coupling) for number, coupling in enumerate(couplings)]
+    of_copy = couplings[: len(couplings) // layout.copies]
+    lone = [(first, first + len(coupling.radii)) for _, first, coupling in of_copy if not layout.permanent[first]]
+    if sorted(lone) != [(first, last) for first, last, _ in layout.ranges() if first < last]:
+        return None
+    if any(last - first > MOST_CELLS for first, last in lone):
+        return None
+    kinds = {id(coupling): coupling for _, first, coupling in of_copy if not layout.permanent[first]}
+    fields = {key: _own_field(coupling) for key, coupling in kinds.items()}
+    if not fields or None in fields.values():
+        return None
+    bodies = [(first, number, fields[id(coupling)]) for number, first, coupling in couplings if id(coupling) in fields]
+    worlds = layout.worlds_of(np.array([first for first, *_ in bodies]))
+    return BodyFields(bodies, worlds.tolist(), rotations, state)
+
+
+def _own_field(coupling: Coupling) -> OwnField | None:
+    """Return the field of a body, from the cache of shapes or computed."""
+    key = "field by parity", *_operator_key(coupling)
+    return shape_cache().get(f"field of {len(coupling.radii)} cells", key, lambda: own_field(coupling))
+
+
+def _operator_key(coupling: Coupling) -> tuple:
+    """Return what the operator of a body depends on."""
+    key = coupling.positions, coupling.radii, coupling.start, coupling.other
+    return (*key, coupling.grid_tensor, coupling.grid_rotation, coupling.common)
