@@ -42,8 +42,6 @@ class World:
     best: wp.float64  # smallest merit of this solve, negative before the first evaluation
     alpha: wp.types.vector(DEPTH, wp.float64)  # Anderson coefficients
     slowness: wp.float64  # predicted sum of the remaining steps over the last step
-    last_error: wp.float64  # estimate of the error at the last evaluation
-    contraction: wp.float64  # expected ratio of the errors after and before a step, 0 if not measured
     gain: wp.types.vector(DEPTH, wp.float64)  # ratio ‖φΔs‖/‖φΔr‖ of each stored change
 
 

@@ -12,8 +12,6 @@ constexpr double SLOWEST = 20.0;       // largest error amplification by slow co
 constexpr double LEAST = 0.01;         // lower bound of an error, as a fraction of the last change
 constexpr double REMEMBERED = 0.5;     // fraction of the slowness that is kept at an evaluation
 constexpr double DISTINCT = 0.01; // least change of the residual between mixtures, as a fraction of the last change
-constexpr double LEAST_CONTRACTION = 0.01; // of the error by a step of bodies as a whole
-constexpr double AGING = 0.8;              // power of a contraction that a solve takes from an earlier one
 constexpr double ROUNDING = 8.0 * (sizeof(Real) == 4 ? 1.2e-7 : 2.2e-16); // residual at rounding level
 
 // Sums over the moments of a chunk or a world: ‖M − f(H)‖², ‖f(H)‖², ⟨M − f(H), M − f(H')⟩ with H' the field changed by
@@ -133,20 +131,6 @@ CUDA_CALLABLE inline double solution_error(bool has_cells, const double* sums, d
     return energy > residual ? energy : residual;
 }
 
-// Error after the next step, by the contraction of the errors of the last two evaluations in one solve. Each use brings
-// the contraction closer to 1, until a solve measures it again.
-template <class World> CUDA_CALLABLE inline double error_after_step(World& world, double error, double rtol) {
-    const bool measured = world.evaluations > 0 && world.has_change && world.last_error > 0.0;
-    const double contraction = measured ? error / world.last_error : world.contraction;
-    if (measured) world.contraction = contraction < LEAST_CONTRACTION ? LEAST_CONTRACTION : contraction;
-    world.last_error = error;
-    if (!(world.contraction > 0.0 && world.contraction < 1.0) || world.apart > 0 || error <= rtol) return error;
-    const double expected = wp::pow(world.contraction, AGING), predicted = expected * error;
-    if (predicted > rtol) return error;
-    world.contraction = expected;
-    return predicted;
-}
-
 // Chooses a world's next step from its sums.
 template <class State> CUDA_CALLABLE inline void choose_step(State& state, int w, const double* sums) {
     auto& world = state.worlds.data[w];
@@ -157,8 +141,7 @@ template <class State> CUDA_CALLABLE inline void choose_step(State& state, int w
     update_estimates(world, history, sums, merit);
     const bool mixed = mix(world, history, sums, merit, finite);
     const double factor = residual > ROUNDING ? amplification(world, sums, merit, mixed) : 1.0;
-    double error = solution_error(state.has_cells.data[w], sums, residual, factor);
-    if (state.h_change.data != nullptr && state.has_cells.data[w]) error = error_after_step(world, error, state.rtol);
+    const double error = solution_error(state.has_cells.data[w], sums, residual, factor);
     const bool done = check_convergence(state, w, residual, error, finite, failed);
     if (done) {
         const double followed = sums[EARLIER] > 0.0 ? sums[FOLLOWED] / sums[EARLIER] : 0.0;
