@@ -185,15 +185,20 @@ def test_few_moments_take_one_kernel(quantity, which, launches):
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
 def test_many_small_worlds_take_one_kernel(quantity, launches):
-    """A group of threads takes a row; worlds of more moments take tiles."""
-    for size, form in ((12, SHORT), (64, LOOP)):
-        segments = [(k, k + size, k, k + size) for k in range(0, 9600, size)]
-        sums = evaluation(quantity, 9600, segments)
+    """A group of threads takes a row, a smaller group where rows alone fill a GPU; worlds of more moments take tiles."""
+    for size, count, form, group in (
+        (12, 9600, SHORT, 8),
+        (160, 9600, SHORT, 8),
+        (192, 9600, LOOP, 8),
+        (192, 57600, LOOP, 2),
+    ):
+        segments = [(k, k + size, k, k + size) for k in range(0, count, size)]
+        sums = evaluation(quantity, count, segments)
         assert sums.form == form
         launches.clear()
         sums.launch()
         assert launches[0].name == ("sum_and_finish_row" if form == SHORT else "sum_tile")
-        assert launches[-1].threads == 8 * sums.count and len(launches) == (1 if form == SHORT else 2)
+        assert launches[-1].threads == group * sums.count and len(launches) == (1 if form == SHORT else 2)
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
@@ -326,8 +331,8 @@ EXPECTED = {
     "near": {"sum_tile", "make_passes", "begin_flow"},
     "turned": {"sum_tile", "finish", "begin_flow"},
     "yielding": {"sum_tile", "finish", "begin_flow", "add_bias"},
-    "cells": {"sum_and_finish", "add_couplings", "sweep_moment"},
-    "whole": {"sum_and_finish", "add_couplings", "sweep_moment"},
+    "cells": {"sum_and_finish", "multiply_bodies", "sweep_moment"},
+    "whole": {"sum_and_finish", "multiply_bodies", "sweep_moment"},
     "images": {"make_passes", "add_couplings", "add_reactions"},
     "coils": {"sum_tile", "apply_sources", "add_forces", "add_to_probe", "add_eddy_moments"},
     "solids": {"sum_and_finish", "apply_sources", "add_forces", "add_to_probe", "add_eddy_moments"},
