@@ -185,7 +185,7 @@ def test_few_moments_take_one_kernel(quantity, which, launches):
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
 def test_many_small_worlds_take_one_kernel(quantity, launches):
-    """A group of threads takes a row, a smaller group where rows alone fill a GPU; worlds of more moments take tiles."""
+    """A group of threads takes a row, and a small one where rows alone fill a GPU; larger worlds take tiles."""
     for size, count, form, group in (
         (12, 9600, SHORT, 8),
         (160, 9600, SHORT, 8),
