@@ -35,7 +35,7 @@ _OF_SHEETS = 1.5
 where the formulas change with the distance. Without the factor the operator of three sheets of 30 × 30 × 1 mm that lie
 on each other would have an eigenvalue of -0.0014, and forces in stacks of discs would be 1 to 2 % larger. If the factor
 applied to :data:`CLOSE` only, the eigenvalue would be -0.0002, and to :data:`WINDOW` only, -0.0013."""
-_FLATTEST = 3.0
+_LARGEST_RATIO = 3.0
 """Largest ratio of sides that increases a size: the largest of whole cells at automatic spacing. Flatter boxes are
 cells of little volume that the surface cuts."""
 CLOSE = 1.75, 2.25
@@ -259,7 +259,7 @@ class CellPairs:
             sides = coupling.half_sides.T
             group[span], body[span], half[:3, span] = worlds[span], number, sides
             most, least = sides.max(axis=0), sides.min(axis=0)
-            half[3, span] = 2.0 * most * np.sqrt(np.minimum(most / least, _FLATTEST)) * _volume_factors(sides)
+            half[3, span] = 2.0 * most * np.sqrt(np.minimum(most / least, _LARGEST_RATIO)) * _volume_factors(sides)
             half[3, span] *= _OF_SHEETS if coupling.is_sheet else 1.0
         near_balls = _balls_among_cells(layout.single_balls, layout.radii, worlds, group, half)
         group[near_balls], body[near_balls] = worlds[near_balls], len(bodies)

@@ -2,26 +2,32 @@
 
 The dynamics are integrated exactly in time. All arrays stay on the device.
 
-With M1 and M2 symmetric about H_eff, ‖M‖ = Ms cos θ, and ln cot(θ/2) = artanh(‖M‖/Ms) grows linearly in time. The
-unknown is therefore the dual variable s = k f⁻¹(M)/Ms of every inducible moment, with M = Ms c(‖s‖) ŝ. The exact
-solution over a step is s ← (1 − ω) s + ω k H/Ms, ω = κ/k, κ = βΔtMs. One field evaluation gives the target g =
-k H(M)/Ms and the residual r = g − s. With the last few changes Δs_j, Δr_j, Anderson's step is
+An inducible moment has the magnetization M, the saturation Ms, and the curve M = f(H) with the initial slope k. H is
+the field at the moment, without that of its own ball: H = H0 + G M, with the applied field H0 and the coupling G of all
+moments. In the paper M is the mean of two submagnetizations M1 and M2 of length Ms, each at the angle θ from the
+effective field H_eff = H − f⁻¹(M), towards which they turn at a rate β. Then ‖M‖ = Ms cos θ, and ln cot(θ/2) =
+artanh(‖M‖/Ms) grows linearly in time. The unknown is therefore the dual variable s = k f⁻¹(M)/Ms of every moment, so
+that M = Ms c(‖s‖) s/‖s‖ with the curve c in units of Ms. The exact solution over a step of length Δt is s ← (1 − ω) s +
+ω k H/Ms, with ω = κ/k and κ = βΔtMs. One evaluation of the field gives the target g = k H/Ms and the residual r = g −
+s. With the last few changes Δs_j and Δr_j from one evaluation to the next, Anderson's step is
 
     s̄ = s − Σ_j α_j Δs_j,   r̄ = r − Σ_j α_j Δr_j,   s ← s̄ + ω r̄,    α = argmin ‖φ r̄‖.
 
-The weight φ = Ms c(a)/a, a = max(‖s‖, ‖g‖), converts a residual to magnetization, so that the large s of saturated
-moments does not dominate. The plain step is mirror descent on the energy divided by μ0, Σ V [Φ(M) − ½ M·GM − H0·M]. It
-is convex for the ball-averaged kernel. Let L_i = 1 + k (2/3 + o_i + f_i), with o_i the volumes that a ball shares with
-others, over the roots of the products of both volumes (``stiffness_of`` in ``theta_flow.h``). The energy decreases from
-any state for ω_i ≤ 1/L_i, and near the solution the steps converge for ω_i < 2/L_i. Cells of bodies that take steps as
-a whole (``body_products.py``) have a demagnetizing factor f_i of overlaps, others have f_i = 0.
+The vector s̄ is called a mixture. The weight φ = Ms c(a)/a, a = max(‖s‖, ‖g‖), converts a residual to magnetization, so
+that the large s of saturated moments does not dominate. A plain step, with α = 0, is mirror descent on the energy
+divided by μ0, Σ V [Φ(M) − ½ M·GM − H0·M]. V are the volumes of the moments, and Φ is the integral of f⁻¹. The energy is
+convex for the ball-averaged kernel. Let L_i = 1 + k (2/3 + o_i + f_i), with o_i the sum of the volumes that ball i
+shares with others, each over the root of the product of both balls' volumes (``stiffness_of`` in ``theta_flow.h``). The
+energy decreases from any state for ω_i ≤ 1/L_i, and near the solution the steps converge for ω_i < 2/L_i. Cells of
+bodies that take steps as a whole (``body_products.py``) have a demagnetizing factor f_i of overlaps, others have
+f_i = 0.
 
-Let a mixture be a vector s̄. After as many evaluations as stored changes, the newest stored change is replaced if the
-current iterate is the best so far. The new one is the difference between the current s̄ and the previous s̄. The
-coupling is symmetric, so that few such changes are as good as all (conjugate residuals; short-term recurrence of Wei,
-Bao and Liu 2022). Heaps of plates and bars then take 26 evaluations instead of 35. Sheets that lie on each other take
-less than half as many. The field of a mixture is not evaluated. Where iterates do not improve, or r̄ hardly changes,
-differences between iterates are more precise, and are kept.
+After as many evaluations as stored changes, the newest stored change is replaced if the current iterate is the best so
+far. The new one is the difference between the current mixture and the previous one. The coupling is symmetric, so that
+few such changes are as good as all (conjugate residuals; short-term recurrence of Wei, Bao and Liu 2022). Heaps of
+plates and bars then take 26 evaluations instead of 35. Sheets that lie on each other take less than half as many. The
+field of a mixture is not evaluated. Where iterates do not improve, or r̄ hardly changes, differences between iterates
+are more precise, and are kept.
 
 A step changes the field most at near neighbors. Sweeps update the neighbors' part without another evaluation of the
 whole field. With the coupling G' of the listed neighbors, two sweeps s ← s + ω' (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s)
@@ -38,7 +44,8 @@ r̄ as an error, weighted by λ. So the estimate amplifies the residual (Eq. 12)
 
     error = ‖M − f(H)‖/‖f(H)‖ · max(1, σ [λ ‖φ r̄‖ + γ √(‖φ r‖² − ‖φ r̄‖²)]/‖φ r‖),
 
-with λ = ‖φ (2 − ω₁) r‖/‖φ r‖. In long solves λ is replaced by max(λ, γ), because slow modes remain in r̄.
+with λ = ‖φ (2 − ω₁) r‖/‖φ r‖, and σ as below. In long solves λ is replaced by max(λ, γ), because slow modes remain in
+r̄.
 
 Inside a body of iron, closed loops of magnetization have almost no field. They barely change the residual, and do not
 affect forces or fields outside. So in worlds with bodies of cells the error is measured in the energy norm. Let A =
@@ -48,10 +55,10 @@ max(1, …) be the amplification above, b = k H0/Ms the reduced applied field, a
     error = max(‖M − f(H)‖/‖f(H)‖, √(A ⟨M − f(H), M − f(H')⟩/⟨φ s, φ b⟩)).
 
 The energy norm of an error e is √⟨e, r⟩. For bodies that take steps as a whole (``body_products.py``), r' = Q r
-approximates e. For other bodies M − f(H) and M − f(H') are equal. The energy norm of the solution is √⟨s, b⟩. In a long
-bar along the field a slow mode dominates the solution, and the error is the same in both norms. A steel plate of
-60 × 60 × 3 mm that a magnet lifts takes 2 evaluations per solve. Ending these solves at ``rtol`` contributes an error
-of 1e-4 to the force on the plate. The error of the cells is not included.
+approximates e, with the inverse Q of their operator. For other bodies M − f(H) and M − f(H') are equal. The energy norm
+of the solution is √⟨s, b⟩. In a long bar along the field a slow mode dominates the solution, and the error is the same
+in both norms. A steel plate of 60 × 60 × 3 mm that a magnet lifts takes 2 evaluations per solve. Ending these solves at
+``rtol`` contributes an error of 1e-4 to the force on the plate. The error of the cells is not included.
 
 With slow convergence many steps like the last one remain. The factor σ is their geometric series ρ/(1 − ρ), and at
 least 1, with ρ the ratio of ‖φ r‖ to its smallest earlier value. At least half of σ is kept at the next evaluation. The

@@ -9,11 +9,11 @@ from warpmag.errors import InputError
 from warpmag.shapes.solids import Solid, boxes_meet, grid
 
 _FINE_POINTS = 32
-"""Smallest number of test points along each axis of a shape, unless ``_MOST_SPLITS`` limits it."""
-_MOST_SPLITS = 8
+"""Smallest number of test points along each axis of a shape, unless cells with ``_CELL_POINTS`` have fewer."""
+_CELL_POINTS = 8
 """Number of test points along each axis of a cell, if several shapes share a grid. Cells that are small beside the
 thinnest shape have 4."""
-_FLATTEST = 4.0
+_LARGEST_REFINEMENT = 4.0
 """Largest ratio of spacing to cell side in a shared grid, where thin shapes get several cells across."""
 _SMALL = 0.1
 """Shapes below this share of the largest shape's volume do not make the cells of a shared grid narrower."""
@@ -148,7 +148,7 @@ class CellGrid:
 
     def _filled_by_thin_shape(self, part: Solid, others: list[Solid], pitch: np.ndarray) -> Filled:
         """Return :meth:`filled` of a thin shape from its own test points, because the grid's points may miss it."""
-        points = part.test_points(self._point_counts(np.maximum((part.upper - part.lower) / pitch, _MOST_SPLITS)))
+        points = part.test_points(self._point_counts(np.maximum((part.upper - part.lower) / pitch, _CELL_POINTS)))
         inside, free = _inside(part, others, points)
         point_count, points = np.count_nonzero(inside), points[free]
         coordinates = (points - self.lower) / self.sides
@@ -168,7 +168,7 @@ class CellGrid:
 def cells_over(parts: Sequence[Solid], earlier: Sequence[Solid], spacing: float, across: int) -> CellGrid:
     """Return a grid of cells with sides of about ``spacing`` [m] over ``parts`` of a body outside ``earlier`` shapes.
 
-    ``across`` is the smallest number of cells across a shape. In a shared grid ``_FLATTEST`` limits it.
+    ``across`` is the smallest number of cells across a shape. In a shared grid ``_LARGEST_REFINEMENT`` limits it.
     """
     largest = max(parts, key=lambda part: part.volume)
     solids = [_in_frame_of(largest, part) for part in (*earlier, *parts)]
@@ -179,7 +179,7 @@ def cells_over(parts: Sequence[Solid], earlier: Sequence[Solid], spacing: float,
     large = np.array([part.volume >= _SMALL * largest.volume for part in parts])
     thinnest = np.where(large[:, None], half, np.inf).argmin(axis=0), np.arange(3)
     thin, face = 2.0 * half[thinnest], (middle - half)[thinnest]
-    flattest = np.inf if len(parts) == 1 else _FLATTEST if across > 1 else 1.0
+    flattest = np.inf if len(parts) == 1 else _LARGEST_REFINEMENT if across > 1 else 1.0
     fit = np.maximum(np.rint(thin / spacing), np.minimum(across, flattest * thin / spacing))
     if len(solids) == 1:
         fit = _fit_steps(largest, fit, across)
@@ -190,7 +190,7 @@ def cells_over(parts: Sequence[Solid], earlier: Sequence[Solid], spacing: float,
     if len(parts) == 1:
         splits = -(-splits // 8) * 8  # demagnetizing tensors use 8 subcells
     else:
-        splits = np.where(splits > 4, _MOST_SPLITS, 4)  # with 8 always, a hammer of two shapes has an eigenvalue < 0
+        splits = np.where(splits > 4, _CELL_POINTS, 4)  # with 8 always, a hammer of two shapes has an eigenvalue < 0
     lower = face - cells_before * sides
     return CellGrid(solids, len(earlier), lower, sides, counts, splits, largest.position, largest.rotation)
 

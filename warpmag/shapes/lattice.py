@@ -52,17 +52,17 @@ AUTOMATIC_COUNT = 729
 """Largest number of moments of a body at automatic spacing: 9³, see the table above. A body of n shapes with c cells
 across may have c³ n, if that is more: 27 for each shape of an inducible body of more than 27 shapes."""
 LEAST_ACROSS = 3
-"""Smallest number of cells across an inducible shape at automatic spacing. The test case is a ferrite cube of 20 mm at
-0.5 mm from a plate of 40:40:5 mm. The force is 4 % too small with 3 cells across, and 6 % with 2. More cells are
-flatter and slower. Shapes so thin that cells would be flatter than :data:`FLATTEST` have fewer."""
+"""Smallest number of cells across an inducible shape at automatic spacing. Before cells had charges on their faces near
+magnets, the force of a ferrite cube of 20 mm at 0.5 mm from a plate of 40:40:5 mm was 4 % too small with 3 cells
+across, and 6 % with 2. More cells are flatter and slower. Shapes so thin that cells would be flatter than :data:`FLATTEST` have fewer."""
 
 FLATTEST = 3.0
 """Largest ratio of a cell's sides at automatic spacing, unless a shape is one cell across. The force on a sheet follows
-from the magnetization along it. The test case is a ferrite cube of 20 mm at 0.5 mm from a sheet of 100:100:2 mm. The
-force is 10 to 18 % too small with cells 1.9 times as wide as thick. With three cells across, 10 times as wide as thick,
-it is between 50 % too small and 65 % too large. A magnet of 20:5 mm at 1 mm from a plate of 80:3 mm pulls 16 % too
-little with one cell across, and 8 % with two that are 2.8 times as wide as thick: the faces of a cell have opposite
-charges, but those of a plate have not."""
+from the magnetization along it. Before cells had charges on their faces near magnets, the force of a ferrite cube of
+20 mm at 0.5 mm from a sheet of 100:100:2 mm was 10 to 18 % too small with cells 1.9 times as wide as thick. With three
+cells across, 10 times as wide as thick, it was between 50 % too small and 65 % too large. A magnet of 20:5 mm at 1 mm
+from a plate of 80:3 mm pulled 16 % too little with one cell across, and 8 % with two that are 2.8 times as wide as
+thick: the faces of a cell have opposite charges, but those of a plate have not."""
 
 LONGEST = 1.25
 """Largest ratio of a cell's longest side to the next one at automatic spacing. Longer cells are poor dipoles along a
