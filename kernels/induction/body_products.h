@@ -1,8 +1,9 @@
 // Products with operators of bodies: the fields of a body's own moments, and steps of bodies as a whole.
 // body_products.py has the equations.
 //
-// The operators act on parities of the mirrored body separately (``warpmag.shapes.body_response``). FOLD writes the
-// parts of the residuals of each parity, in the frames of the bodies, and WRITE_WEIGHTS the weight w of each body.
+// The operators act on parities of the mirrored body separately (``warpmag.shapes.body_response``). A part is the
+// component of the residuals, or of the moments, of a group of bodies that has one parity. FOLD writes the parts of the
+// residuals of each parity, in the frames of the bodies, and WRITE_WEIGHTS the weight w of each body.
 // MULTIPLY multiplies each part by its table Q − 1. UNFOLD adds the result to the field. FOLD_MOMENTS, MULTIPLY_FIELD
 // and UNFOLD_FIELD add the field T m to the applied field in the same way. Bodies with the same tables form groups of
 // at most ``MEMBERS``, so that a GPU reads a table once for several bodies; a CPU, whose caches hold the tables, has
@@ -21,11 +22,12 @@ constexpr int MIRRORS = 8;       // sets of mirrors across x, y and z
 
 enum BodyPass { FOLD, WRITE_WEIGHTS, MULTIPLY, UNFOLD, FOLD_MOMENTS, MULTIPLY_FIELD, UNFOLD_FIELD }; // as in Python
 
-// Whether a world takes no steps, or needs no field.
+// True if the world takes no steps of bodies as a whole.
 template <class Steps> CUDA_CALLABLE inline bool skips_steps(const Steps& steps, int world) {
     const auto& solve = steps.state.worlds.data[world];
     return solve.active == 0 || solve.apart > 0;
 }
+// True if the world needs no field.
 template <class Steps> CUDA_CALLABLE inline bool skips_field(const Steps& steps, int world) {
     return steps.state.resting.data[world] != 0 || (!steps.everywhere && steps.state.worlds.data[world].active == 0);
 }
@@ -107,7 +109,7 @@ CUDA_CALLABLE inline void fold(const Steps& steps, int body, int offset, bool sk
         v[g] = scale * to_body(rotation, value(signed_moment < 0 ? -1 - signed_moment : signed_moment));
     }
     transform(v, at.mirrors);
-    Real* const out = steps.residual.data + body % MEMBERS;
+    Real* const out = steps.input.data + body % MEMBERS;
     visit_parities(at, [&](int p, size_t first) {
         const Number x = v[p ^ (1 & at.mirrors)].x, y = v[p ^ (2 & at.mirrors)].y, z = v[p ^ (4 & at.mirrors)].z;
         for (int l = 0; l < at.count; ++l) {
@@ -116,13 +118,14 @@ CUDA_CALLABLE inline void fold(const Steps& steps, int body, int offset, bool sk
         }
     });
 }
-// Calls put(i, moment, product, count) with the products at the orbits of a body from ``offset`` on, in the world, for
-// each set of mirrors: ``count`` moments i, where ``moment`` is negative for moments that occur before.
+// Calls put(i, moment, product, count) for each set of mirrors, with up to WIDTH products at the orbits of a body from
+// ``offset`` on, in the world. Where an earlier set of mirrors has the same image of a cell, ``moment`` is negative,
+// and put() skips it; elsewhere it is i, the index of the moment.
 template <class Steps, class Put>
 CUDA_CALLABLE inline void unfold(const Steps& steps, int body, int offset, bool skips, Put put) {
     const Orbits at = orbits_at(steps, body, offset);
     if (share() != 0 || at.count == 0 || skips) return;
-    const Real* const parts = steps.response.data + body % MEMBERS;
+    const Real* const parts = steps.product.data + body % MEMBERS;
     Vector v[MIRRORS];
     visit_parities(at, [&](int p, size_t first) {
         Number components[3];
@@ -180,7 +183,7 @@ template <class Steps> CUDA_CALLABLE inline void unfold_field(const Steps& steps
            });
 }
 
-// Writes the weight of a body from the means of the shares d and the excesses e of its cells.
+// Writes the weight of a body from the means d and e of body_products.py.
 template <class Steps> CUDA_CALLABLE inline void write_weight(const Steps& steps, int body) {
     const auto& cells = steps.body.data[body];
     const auto& state = steps.state;
@@ -204,7 +207,7 @@ template <class Steps> CUDA_CALLABLE inline void write_weight(const Steps& steps
     if (share() != 0) return;
     Real d = 0, e = 0;
     for (int l = 0; l < WIDTH; ++l) d += lane_of(shares, l), e += lane_of(excesses, l);
-    const Real largest = steps.gain.data[body], least = 1 + (e - d * largest / (1 + largest)) / cells[1];
+    const Real largest = steps.largest.data[body], least = 1 + (e - d * largest / (1 + largest)) / cells[1];
     const Real change = 1 / least - 1;
     steps.weight.data[body] = (change > 0 ? change : 0) / largest;
 }
@@ -238,11 +241,12 @@ CUDA_CALLABLE inline void add_products(const Real* residuals, Vector (&sums)[MEM
     }
 }
 
-// Orbits of a part from ``offset`` on: places of the parts in the arrays, their number, and that of the part's orbits;
-// ``table`` is the first entry for these orbits, with ``entries`` for each CHUNK of targets.
+// Orbits of a part from ``offset`` on.
 struct PartRows {
-    size_t first;
-    int orbits, left, entry;
+    size_t first; // place of the part in the arrays
+    int orbits;   // of the part
+    int left;     // number of these orbits, at most WIDTH
+    int entry;    // of the table for these orbits, of ``entries`` for each CHUNK of them
 };
 template <class Steps>
 CUDA_CALLABLE inline PartRows part_rows(const Steps& steps, int number, int offset, int entries) {
@@ -261,7 +265,7 @@ template <class Steps, class Skips> CUDA_CALLABLE inline bool all_skip(const Ste
 template <class Steps>
 CUDA_CALLABLE inline void put_products(const Steps& steps, const PartRows& at, int offset,
                                        const Vector (&sums)[MEMBERS]) {
-    Real* const out = steps.response.data + at.first + 3 * MEMBERS * (size_t)offset;
+    Real* const out = steps.product.data + at.first + 3 * MEMBERS * (size_t)offset;
     for (int w = 0; w < MEMBERS; ++w) {
         const Vector sum = group_sums(sums[w]);
         if (share() != 0) continue;
@@ -277,7 +281,7 @@ template <class Steps> CUDA_CALLABLE inline void multiply(const Steps& steps, in
     if (all_skip(steps, number, [&](int world) { return skips_steps(steps, world); })) return;
     const int pairs = (steps.part.data[number][1] + 1) / 2;
     const PartRows at = part_rows(steps, number, offset, pairs);
-    const Real* const residuals = steps.residual.data + at.first;
+    const Real* const residuals = steps.input.data + at.first;
     const int* const table = steps.table.data + (size_t)ENTRY * at.entry + offset % CHUNK;
     const Number zero = Number(Real(0));
     Vector sums[MEMBERS];
@@ -298,7 +302,7 @@ template <class Steps> CUDA_CALLABLE inline void multiply(const Steps& steps, in
 template <class Steps> CUDA_CALLABLE inline void multiply_field(const Steps& steps, int number, int offset) {
     if (all_skip(steps, number, [&](int world) { return skips_field(steps, world); })) return;
     const PartRows at = part_rows(steps, number, offset, steps.part.data[number][1]);
-    const Real* const moments = steps.residual.data + at.first;
+    const Real* const moments = steps.input.data + at.first;
     const Real* const table = steps.tensors.data + (size_t)ENTRY * at.entry + offset % CHUNK;
     const Number zero = Number(Real(0));
     Vector sums[MEMBERS];

@@ -1,8 +1,8 @@
 """Products with operators of bodies of cells: fields of their own moments, and steps of the induction as a whole.
 
 **Fields.** In worlds with a single inducible body its moments m have the field T m, with the tensors T between its
-cells (``warpmag.shapes.body_response``). The products replace sums over pairs, and take an eighth of the time where
-mirrors map the body to itself.
+cells (``warpmag.shapes.body_response``). The products replace sums over pairs. For a plate of 722 cells they take a
+sixth of the time of the sums on a CPU.
 
 **Steps.** The residual of a body's moments, r = k H/Ms − s, becomes r + w (Q − 1) r with the inverse Q of the body's
 own operator. The θ dynamics then take their usual step. Q r is the error of a lone body, and ⟨r, Q r⟩ the square of its
@@ -10,15 +10,15 @@ energy norm, a criterion of convergence (``theta_step.h``).
 
 Q belongs to χ = ∞ without saturation, and to bodies that do not intersect. Q multiplies a mode of eigenvalue λ by 1/λ.
 Saturation and overlap change this eigenvalue to λ' = 1 − d (1 − λ) + e. Here d is the mean of (k/3) ‖M‖/(Ms ‖s‖) over
-the body. e is the mean of k max(0, o_i + f_i − 0.2) with o_i and f_i of ``theta_flow.py``: cells of bodies that only
-touch have o_i + f_i ≤ 0.2, if their sizes are similar. The weight w = max(0, (1/λ' − 1)/(1/λ − 1)), with the smallest λ
-of the body, is the largest that is safe for all modes. After a rejected step, w is 0 in the next few solves.
+the body. e is the mean of k max(0, o_i + f_i − CONTACT) with o_i and f_i of ``theta_flow.py``. CONTACT is the largest
+o_i + f_i of cells of similar size whose bodies only touch. The weight w = max(0, (1/λ' − 1)/(1/λ − 1)), with the
+smallest λ of the body, is the largest that is safe for all modes. After a rejected step, w is 0 in the next few solves.
 
-Sweeps leave out the pairs within such a body. Letters in contact take half as many evaluations as with sweeps alone. A
-plate on a magnet takes a quarter as many. The elements of Q − 1 are stored as bfloat16, the upper 16 bits of float32:
-this precision suffices, and reading the tables takes most of the time. If mirrors map the cells of a body to each
-other, there is a table for each parity (``warpmag.shapes.body_response``). The values of the images of a cell are added
-with the signs of the parity, and the products are distributed with the same signs.
+Sweeps leave out the pairs within such a body. Iron letters in contact take half as many evaluations as with sweeps
+alone. A plate on a magnet takes a quarter as many. The elements of Q − 1 are stored as bfloat16, the upper 16 bits of
+float32: this precision suffices, and reading the tables takes most of the time. If mirrors map the cells of a body to
+each other, there is a table for each parity (``warpmag.shapes.body_response``). The values of the images of a cell are
+added with the signs of the parity, and the products are distributed with the same signs.
 """
 
 from collections.abc import Sequence
@@ -59,14 +59,16 @@ def _products_type(dtype):
             int
         ]  # cells of each orbit by sets of mirrors, of all kinds of bodies, [MIRRORS · padded orbits]
         body: wp.array[wp.vec4i]  # by groups: first moment, cells or 0, index of the rotation, world
-        group: wp.array[wp.vec4i]  # of bodies: first image, bits of mirrors, orbits, first place in ``residual``
+        group: wp.array[wp.vec4i]  # of bodies: first image, bits of mirrors, orbits, first place in ``input``
         part: wp.array[wp.vec4i]  # of each parity: group, orbits, first entry of the table, first place
         body_chunk: wp.array[wp.vec2i]  # body and first of up to CHUNK orbits
         part_chunk: wp.array[wp.vec2i]  # part and first of up to CHUNK orbits
-        gain: wp.array[dtype]  # largest eigenvalue of Q − 1 of each body
+        largest: wp.array[dtype]  # largest eigenvalue of Q − 1 of each body
         rotation: wp.array[quaternion]  # from the frames of bodies to the world (x, y, z, w)
-        residual: wp.array[dtype]  # residuals by parity, in the frames of the bodies, shape [places, 3, members]
-        response: wp.array[dtype]  # their products with Q − 1, same shape
+        input: wp.array[
+            dtype
+        ]  # residuals or moments by parity, in the frames of the bodies, shape [places, 3, members]
+        product: wp.array[dtype]  # their products with the tables, same shape
         weight: wp.array[dtype]  # w of each body
         state: state_type(dtype)
 
@@ -196,7 +198,7 @@ class _BodyProducts:
         self._kind = np.repeat(np.arange(len(kinds)), rows_of_kinds)  # of each row of ``body``
         steps.body_chunk = chunks([groups[k // members][2] for k in range(len(rows))])
         steps.part_chunk = chunks([part[1] for part in parts])
-        steps.residual, steps.response = (
+        steps.input, steps.product = (
             wp.zeros(3 * members * place, dtype=self._dtype, device=self._device) for _ in range(2)
         )
         return tables
@@ -221,7 +223,7 @@ class BodySteps(_BodyProducts):
             wp.zeros(len(steps.body), dtype=self._dtype, device=self._device),
         )
         largest = [operator.largest for operator in operators]
-        steps.gain = self._put(np.array(largest)[self._kind], self._dtype)
+        steps.largest = self._put(np.array(largest)[self._kind], self._dtype)
 
     def launch(self):
         """Launch the change of the field at the moments of the bodies."""

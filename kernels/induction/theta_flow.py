@@ -18,16 +18,16 @@ that the large s of saturated moments does not dominate. A plain step, with α =
 divided by μ0, Σ V [Φ(M) − ½ M·GM − H0·M]. V are the volumes of the moments, and Φ is the integral of f⁻¹. The energy is
 convex for the ball-averaged kernel. Let L_i = 1 + k (2/3 + o_i + f_i), with o_i the sum of the volumes that ball i
 shares with others, each over the root of the product of both balls' volumes (``stiffness_of`` in ``theta_flow.h``). The
-energy decreases from any state for ω_i ≤ 1/L_i, and near the solution the steps converge for ω_i < 2/L_i. Cells of
-bodies that take steps as a whole (``body_products.py``) have a demagnetizing factor f_i of overlaps, others have
-f_i = 0.
+energy decreases from any state for ω_i ≤ 1/L_i, and near the solution the steps converge for ω_i < 2/L_i. f_i
+is the demagnetizing factor of overlaps (``stiffness_of``). It is 0 except for moments that act by tensors alone: cells
+of bodies that take steps as a whole (``body_products.py``), and few moments in place of a body.
 
 After as many evaluations as stored changes, the newest stored change is replaced if the current iterate is the best so
 far. The new one is the difference between the current mixture and the previous one. The coupling is symmetric, so that
 few such changes are as good as all (conjugate residuals; short-term recurrence of Wei, Bao and Liu 2022). Heaps of
-plates and bars then take 26 evaluations instead of 35. Sheets that lie on each other take less than half as many. The
-field of a mixture is not evaluated. Where iterates do not improve, or r̄ hardly changes, differences between iterates
-are more precise, and are kept.
+plates and bars then take 26 evaluations instead of 35. Sheets that lie on each other take less than half as many
+evaluations as without such changes. The field of a mixture is not evaluated. Where iterates do not improve, or r̄
+hardly changes, differences between iterates are more precise, and are kept.
 
 A step changes the field most at near neighbors. Sweeps update the neighbors' part without another evaluation of the
 whole field. With the coupling G' of the listed neighbors, two sweeps s ← s + ω' (ḡ + (k/Ms) G' (M(s) − M(s̄)) − s)

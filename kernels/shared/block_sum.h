@@ -4,10 +4,10 @@
 namespace warpmag {
 
 #if defined(__CUDA_ARCH__)
-constexpr int MOST_WARPS = 8; // of a block that sums
+constexpr int MOST_WARPS = 8; // largest number of warps of a block that sums
 
-// Adds up LEFT columns over the threads of a warp. In each exchange a thread passes on half of its columns, so that it
-// ends with the sum of one.
+// Adds up LEFT columns, the components of the vector, over the threads of a warp. In each exchange a thread passes on
+// half of its columns, so that it ends with the sum of one.
 template <int STEP, int LEFT, class Scalar> CUDA_CALLABLE inline void add_columns(Scalar* columns) {
     constexpr int HALF = LEFT / 2;
     const bool upper = HALF > 0 && (threadIdx.x & STEP) != 0;
@@ -19,7 +19,7 @@ template <int STEP, int LEFT, class Scalar> CUDA_CALLABLE inline void add_column
     if constexpr (STEP > 1) add_columns<STEP / 2, LEFT - HALF>(columns);
 }
 
-// All threads of the block call this function, and get the same sum.
+// All threads of the block call this function, and receive the same sum.
 template <unsigned N, class Scalar> CUDA_CALLABLE inline wp::vec_t<N, Scalar> block_sum(wp::vec_t<N, Scalar> value) {
     static_assert(N <= 32);
     constexpr int COLUMNS = N > 16 ? 32 : N > 8 ? 16 : N > 4 ? 8 : N > 2 ? 4 : 2;

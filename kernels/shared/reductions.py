@@ -1,4 +1,4 @@
-"""Sums over groups of threads of a warp and over blocks, in a fixed order."""
+"""Numbers of threads that share work, sums over them in a fixed order, largest values in blocks, and memory fences."""
 
 from functools import cache
 from typing import Any
@@ -15,9 +15,9 @@ _BLOCKS = 16  # per multiprocessor of a GPU, in launches over lists
 
 
 def group_threads(device, *, moments: int = 0, long_lists: bool = False) -> int:
-    """Number of threads that share the neighbors of a moment: 1 on a CPU, on a GPU 8, or a warp for long lists.
+    """Return the number of threads that share the neighbors of a moment.
 
-    It is 2 where a pass has many ``moments``.
+    It is 1 on a CPU. On a GPU it is 32 for long lists, 2 if a pass has 50,000 ``moments`` or more, and 8 otherwise.
     """
     if not device.is_cuda:
         return 1

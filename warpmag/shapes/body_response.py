@@ -5,11 +5,14 @@ An induction solve compares the reduced field g = k H/M_s of each moment with it
 Here 3 is the initial slope k of a ball, T are the tensors between the body's cells, and V their volumes. Among other
 bodies, Q removes the slow modes of the body itself from the iteration.
 
-**Mirrors.** Let the cells of a body be symmetric with respect to m planes through its center, each normal to an axis.
-Then the operator acts separately on magnetizations of each of 2ᵐ parities p. A parity is one sign for each mirror: the
+T excludes the field of a cell in its own ball. :data:`_SHIFT` is added to the eigenvalues before the inversion.
+
+**Mirrors.** Let the cells of a body be symmetric with respect to q planes through its center, each normal to an axis.
+Then the operator acts separately on magnetizations of each of 2^q parities p. A parity is one sign for each mirror: the
 mirror leaves the magnetization unchanged, or reverses it. A mirror reverses the component along its normal. The cells
 that mirrors map to each other are an orbit. The values at one cell of each orbit determine a magnetization of parity p.
-So 2ᵐ matrices between orbits replace the matrix between cells. For a plate they have an eighth of its elements.
+So 2^q matrices between orbits replace the matrix between cells. If no cell lies on a plane, they have 1/2^q of its
+elements.
 
 The field T m of the body's own moments m is computed with such matrices, too, where they are small enough.
 """
@@ -28,11 +31,11 @@ MOST_CELLS = 1000
 _SLOPE = 3.0
 """Initial slope k = 3χ/(3 + χ) of a ball of χ = ∞."""
 _SHIFT = 0.01
-"""Number added to all eigenvalues before the inversion, because those of sheets and of loops of magnetization are below
-0.001. With 0.03 a lone plate of χ = ∞ takes 1.5 times as many evaluations. With 0.001 a plate of χ = 300 takes 1.3
-times as many."""
+"""Number added to all eigenvalues before the inversion, because the eigenvalues of sheets and of loops of magnetization
+are below 0.001. With 0.03 a lone plate of χ = ∞ takes 1.5 times as many evaluations. With 0.001 a plate of χ = 300
+takes 1.3 times as many."""
 _POWERS = 30
-"""Number of steps of the power method; the largest eigenvalue then has an error of some percent."""
+"""Number of steps of the power method; the largest eigenvalue then has an error of a few percent."""
 _SYMMETRIC, _SYMMETRIC_FIELD = 1e-3, 1e-6
 """Tolerances of a symmetry, for the response and for the field. They bound three changes by a mirror: of positions, in
 radii, and the relative changes of radii and of the operator times a random vector. Solves converge to the same solution
@@ -55,8 +58,8 @@ class OwnField(NamedTuple):
     """Field of a body's moments, by parity."""
 
     cells: int
-    mirrors: int
-    images: np.ndarray  # these as of :class:`BodyResponse`
+    mirrors: int  # as in :class:`BodyResponse`
+    images: np.ndarray  # as in :class:`BodyResponse`
     tables: np.ndarray  # T [1/m³] between orbits, shape [parities, orbits, 3, orbits, 3]
 
 

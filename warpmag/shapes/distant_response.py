@@ -2,16 +2,18 @@
 
 Fields of sources beyond a surface around the body equal fields of charges on that surface. Over the body they vary
 slowly: a few combinations of them, F at the cells, span all others up to a tolerance. Let R be the response of the
-cells to any field (``demagnetization.py``), and Q = FᵀRF. Moments at few points with the same fields E there act like
-the cells up to the tolerance if their response P has EᵀPE = Q. With the pseudoinverse E⁺,
+cells to any field (``demagnetization.py``), and Q = FᵀRF. Moments at few points with the same fields F' there act like
+the cells up to the tolerance if their response R' has F'ᵀR'F' = Q. With the pseudoinverse F'⁺ and ε =
+:data:`_OTHER_RESPONSE`,
 
-    P = E⁺ᵀ Q E⁺ + ε (1 − E E⁺),
+    R' = F'⁺ᵀ Q F'⁺ + ε (1 − F' F'⁺),
 
 with fields and magnetizations times the roots of volumes, so that a uniform magnetization stays uniform. The second
-term lets the moments respond to other fields as well, so that P has an inverse: the moments follow a magnetization
-curve like cells. For the same reason their volumes V are not those of groups of cells (:func:`_volumes`). Their own
-field is T = (1/3 − P⁻¹)/V, since a ball of ideal permeability has the response 3. Each point is the centroid of a group
-of cells. The groups are narrower near the ends of the body, where the charges are.
+term lets the moments respond to other fields as well, so that R' has an inverse, and the moments follow a magnetization
+curve like cells. The tensors between the moments are T = (1/3 − R'⁻¹)/V, since a ball of ideal permeability has the
+response 3. The volumes V are chosen so that the mean square of the magnetization is that of the cells
+(:func:`_volumes`). Each point is the centroid of a group of cells. The groups are narrower near the ends of the body,
+where the charges are.
 
 There are several levels, :data:`FAR_TO_NEAR`: the nearer the surface, the more combinations and points. The number of
 points follows from the forces on ball magnets around the body, which act as dipoles. The diameter of each ball equals
@@ -30,9 +32,9 @@ import numpy as np
 from warpmag.shapes.demagnetization import Coupling, full_tensors, pair_law_tensors
 from warpmag.shapes.uniform_response import cell_matrix
 
-FAR_TO_NEAR = 1.2, 0.6, 0.3
-"""Smallest distance of each level from the body's box, which is that of the surface of charges, in halves of the
-longest side of the box."""
+FAR_TO_NEAR = 0.6, 0.3, 0.15
+"""Smallest distance of each level from the body's box, which is that of the surface of charges, in longest sides of the
+box."""
 BALL_ERROR = 0.025
 """Largest relative error of the force of a ball magnet at the smallest distance of a level."""
 POINT_COUNTS = 8, 9, 12, 16, 20, 25, 36, 49, 64, 81, 100, 125, 144, 196
@@ -44,11 +46,11 @@ MOST_REPLACED_CELLS = 1000
 _SOURCE_SPACING = 0.75
 """Largest spacing of the charges on the surface, in distances of the surface from the body."""
 _LEAST_FIELD = 0.003
-"""Smallest singular value of a combination of fields that gets a response, over the largest, at the cells and at the
-points."""
+"""Smallest singular value of the fields that counts, over the largest, at the cells and at the points."""
 _EDGE_WEIGHTS = 0.4, 0.8
-"""Weights of Chebyshev's points over equal steps in the ends of groups of cells. In plates the larger one lowers errors
-2 to 5 times, but at susceptibilities below 50 errors of the moment are larger with it."""
+"""Weights of Chebyshev spacing in the boundaries between groups of cells, tried in this order: 0 is uniform, 1 is
+Chebyshev spacing. In plates the larger one lowers errors 2 to 5 times, but at susceptibilities below 50 errors of the
+moment are larger with it."""
 _OTHER_RESPONSE = 1.0
 """Response ε to other fields: that of a sheet to a field normal to it."""
 
@@ -106,7 +108,7 @@ def distant_bodies(body, coupling: Coupling) -> list[DistantBody] | None:
 class _Response:
     """Fields of sources at the distance of a level, and the response of the cells, both times the roots of volumes."""
 
-    distance: float  # in halves of the longest side of the body's box
+    distance: float  # in longest sides of the body's box
     charges: np.ndarray  # places of the charges, shape [s, 3]
     combinations: np.ndarray  # of their fields, shape [s, p]
     fields: np.ndarray  # these combinations at the cells, shape [3 n, p]
@@ -165,20 +167,20 @@ def _fewest_moments(body, response: _Response) -> DistantBody:
     """Return the fewest moments with an error of at most :data:`BALL_ERROR`, or the most that are tried."""
     counts = [count for count in POINT_COUNTS if count < len(body.volumes)]
     for count, edge_weight in itertools.product(counts, _EDGE_WEIGHTS):
-        few, error = _few_moments(body, response, _parts(body.positions, count, edge_weight))
+        few, error = _few_moments(body, response, _groups(body.positions, count, edge_weight))
         if error <= BALL_ERROR:
             break
     return replace(few, reach=few.reach * max(1.0, float(np.cbrt(error / BALL_ERROR))))
 
 
-def _few_moments(body, response: _Response, part: np.ndarray) -> tuple[DistantBody, float]:
+def _few_moments(body, response: _Response, group: np.ndarray) -> tuple[DistantBody, float]:
     """Return moments in place of the cells, and the largest relative error of a ball's force.
 
-    ``part`` is the group of each cell.
+    ``group`` is the group of each cell.
     """
     volumes = body.volumes
-    shares = np.bincount(part, volumes)
-    points = np.stack([np.bincount(part, volumes * x) for x in body.positions.T], axis=1) / shares[:, None]
+    shares = np.bincount(group, volumes)
+    points = np.stack([np.bincount(group, volumes * x) for x in body.positions.T], axis=1) / shares[:, None]
     fields = _scaled_fields(points, shares, response.charges) @ response.combinations
     left, values, right = np.linalg.svd(fields, full_matrices=False)
     rank = int((values > _LEAST_FIELD * values[0]).sum())
@@ -198,7 +200,7 @@ def _few_moments(body, response: _Response, part: np.ndarray) -> tuple[DistantBo
     few = DistantBody(
         _coupling(points, own_volumes, inverse_response / (root[:, None] * root)), own_volumes, lower, upper,
         coefficients=inverse @ inverse_response / root, patterns=patterns.transpose(1, 2, 0).copy(),
-        reach=response.distance * 0.5 * float((upper - lower).max()),
+        reach=response.distance * float((upper - lower).max()),
     )  # fmt: skip
     return few, float((errors / np.linalg.norm(response.forces, axis=0)).max())
 
@@ -206,9 +208,10 @@ def _few_moments(body, response: _Response, part: np.ndarray) -> tuple[DistantBo
 def _volumes(shares: np.ndarray, few: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Return the volumes of few moments [m³], with the sum of ``shares`` [m³].
 
-    At a finite susceptibility or near saturation, the squares of the magnetizations count, too. In unit fields along
-    the axes their mean is that of the cells, if volumes between ``shares`` and those of a uniform magnetization have
-    it. ``few`` and ``cells`` are the magnetizations times the roots of volumes, with ``shares``, shape [3 n, 3].
+    At a finite susceptibility or near saturation, the solution also depends on the mean square of the magnetization.
+    The volumes are interpolated between ``shares`` and those with which all moments have the same magnetization. In
+    unit fields along the axes the mean square is then that of the cells, if possible. ``few`` and ``cells`` are the
+    magnetizations in these fields times the roots of volumes, which are ``shares`` for few moments, shape [3 n, 3].
     """
     few, volume = few.reshape(-1, 3, 3) * np.sqrt(shares)[:, None, None], shares.sum()
     moments = np.linalg.norm(few.sum(axis=0), axis=0)  # along each axis of the field
@@ -229,8 +232,8 @@ def _uniform_fields(volumes: np.ndarray) -> np.ndarray:
 
 
 def _charges(lower: np.ndarray, upper: np.ndarray, distance: float) -> np.ndarray:
-    """Return points at a distance from a box, in halves of its longest side, all around it, shape [s, 3]."""
-    sides = (upper - lower) / (0.5 * (upper - lower).max()) + 2.0 * distance
+    """Return points at a distance from a box, in its longest sides, all around it, shape [s, 3]."""
+    sides = (upper - lower) / (upper - lower).max() + 2.0 * distance
     return _shell(lower, upper, distance, [1 + math.ceil(side / (_SOURCE_SPACING * distance)) for side in sides])
 
 
@@ -241,7 +244,7 @@ def _ball_places(lower: np.ndarray, upper: np.ndarray, distance: float) -> np.nd
 
 def _shell(lower: np.ndarray, upper: np.ndarray, distance: float, counts: list[int]) -> np.ndarray:
     """Return points at a distance from a box, from the surface of a grid of ``counts`` points around it."""
-    distance = distance * 0.5 * (upper - lower).max()
+    distance = distance * (upper - lower).max()
     sides = upper - lower + 2.0 * distance
     grid = [np.linspace(-0.5, 0.5, count) * side for count, side in zip(counts, sides, strict=True)]
     points = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -266,7 +269,7 @@ def _basis(fields: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return fields @ combinations, combinations
 
 
-def _parts(positions: np.ndarray, most: int, edge_weight: float) -> np.ndarray:
+def _groups(positions: np.ndarray, most: int, edge_weight: float) -> np.ndarray:
     """Return a number for each cell: that of its group in a grid of at most ``most`` groups.
 
     Groups at the ends of the grid are narrower if ``edge_weight`` is positive.
@@ -282,13 +285,14 @@ def _parts(positions: np.ndarray, most: int, edge_weight: float) -> np.ndarray:
         counts = finer
     places = ((positions - lower) / sides).T
     index = [
-        np.searchsorted(_ends(count, edge_weight), x, side="right") for count, x in zip(counts, places, strict=True)
+        np.searchsorted(_group_boundaries(count, edge_weight), x, side="right")
+        for count, x in zip(counts, places, strict=True)
     ]
-    _, part = np.unique(np.ravel_multi_index(tuple(index), tuple(counts)), return_inverse=True)
-    return part.reshape(-1)
+    _, group = np.unique(np.ravel_multi_index(tuple(index), tuple(counts)), return_inverse=True)
+    return group.reshape(-1)
 
 
-def _ends(count: int, edge_weight: float) -> np.ndarray:
+def _group_boundaries(count: int, edge_weight: float) -> np.ndarray:
     """Return the places in 0 … 1 between ``count`` groups of cells."""
     equal = np.arange(1, count) / count
     return equal + edge_weight * (0.5 - 0.5 * np.cos(np.pi * equal) - equal)

@@ -54,7 +54,8 @@ across may have c³ n, if that is more: 27 for each shape of an inducible body o
 LEAST_ACROSS = 3
 """Smallest number of cells across an inducible shape at automatic spacing. Before cells had charges on their faces near
 magnets, the force of a ferrite cube of 20 mm at 0.5 mm from a plate of 40:40:5 mm was 4 % too small with 3 cells
-across, and 6 % with 2. More cells are flatter and slower. Shapes so thin that cells would be flatter than :data:`FLATTEST` have fewer."""
+across, and 6 % with 2. More cells are flatter and slower. Shapes so thin that cells would be flatter than
+:data:`FLATTEST` have fewer."""
 
 FLATTEST = 3.0
 """Largest ratio of a cell's sides at automatic spacing, unless a shape is one cell across. The force on a sheet follows
