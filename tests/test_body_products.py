@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 import warpmag
 from bench.systems import moment_system
 from tests.cell_bodies import posed
+from warpmag.moments import body_products
 from warpmag.moments import system as system_module
 from warpmag.shapes import demagnetization, lattice
 from warpmag.shapes.body_response import MOST_CELLS, own_field, residual_response
@@ -142,6 +143,11 @@ def test_fields_by_tables_equal_sums_over_pairs(device, monkeypatch, dtype):
     actual, expected = system.h.numpy(), pairs.h.numpy()
     # rounding of sums over 112 cells, and of positions on the order of cells
     assert np.linalg.norm(actual - expected) < 100.0 * np.finfo(dtype).eps * np.linalg.norm(expected)
+
+
+def test_tables_of_many_kinds_of_bodies_are_left_out(device, monkeypatch):
+    monkeypatch.setattr(body_products, "_MOST_BYTES", 1000)
+    assert worlds_of_a_plate(device)._body_fields is None
 
 
 def test_worlds_at_rest_keep_their_field(device):

@@ -10,8 +10,8 @@ from warpmag.shapes.body_response import MOST_CELLS, BodyResponse, OwnField, own
 from warpmag.shapes.demagnetization import Coupling
 
 _MOST_BYTES = 1 << 27
-"""Size of all tables beyond which further kinds of bodies iterate without steps. Those of a plate have 1.4 MB, those of
-a body of 1,000 cells without mirrors 18 MB."""
+"""Size of all tables beyond which further kinds of bodies iterate without steps, and fields are sums over pairs. Tables
+of steps have 1.4 MB for a plate, and 18 MB for a body of 1,000 cells without mirrors."""
 
 
 def make_body_steps(couplings, layout: MomentLayout, rotations, state, dynamics: str) -> BodySteps | None:
@@ -58,20 +58,35 @@ def make_body_fields(couplings, layout: MomentLayout, rotations, state) -> BodyF
 
     ``couplings`` are those of :func:`make_body_steps`.
     """
-    couplings = [(number, *coupling) for number, coupling in enumerate(couplings)]
     of_copy = couplings[: len(couplings) // layout.copies]
-    lone = [(first, first + len(coupling.radii)) for _, first, coupling in of_copy if not layout.permanent[first]]
-    if sorted(lone) != [(first, last) for first, last, _ in layout.ranges() if first < last]:
+    is_iron = [not layout.permanent[first] for first, _ in of_copy]
+    iron = [coupling for coupling, chosen in zip(of_copy, is_iron, strict=True) if chosen]
+    lone = sorted((first, first + len(coupling.radii)) for first, coupling in iron)
+    if lone != [(first, last) for first, last, _ in layout.ranges() if first < last]:
         return None
     if any(last - first > MOST_CELLS for first, last in lone):
         return None
-    kinds = {id(coupling): coupling for _, first, coupling in of_copy if not layout.permanent[first]}
-    fields = {key: _own_field(coupling) for key, coupling in kinds.items()}
-    if not fields or None in fields.values():
+    fields = _fields({id(coupling): coupling for _, coupling in iron})
+    if not fields:
         return None
-    bodies = [(first, number, fields[id(coupling)]) for number, first, coupling in couplings if id(coupling) in fields]
+    bodies = [
+        (first, number, fields[id(coupling)])
+        for number, (first, coupling) in enumerate(couplings)
+        if is_iron[number % len(of_copy)]
+    ]
     worlds = layout.worlds_of(np.array([first for first, *_ in bodies]))
     return BodyFields(bodies, worlds.tolist(), rotations, state)
+
+
+def _fields(couplings: dict[int, Coupling]) -> dict[int, OwnField] | None:
+    """Return the field of each kind of body, or None if a body has none or all together are too large."""
+    result, size = {}, 0
+    for key, coupling in couplings.items():
+        field = _own_field(coupling)
+        if field is None or (size := size + field.tables.nbytes) > _MOST_BYTES:
+            return None
+        result[key] = field
+    return result
 
 
 def _own_field(coupling: Coupling) -> OwnField | None:
