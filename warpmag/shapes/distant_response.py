@@ -111,8 +111,8 @@ class _Response:
     distance: float  # in longest sides of the body's box
     charges: np.ndarray  # places of the charges, shape [s, 3]
     combinations: np.ndarray  # of their fields, shape [s, p]
-    fields: np.ndarray  # these combinations at the cells, shape [3 n, p]
-    patterns: np.ndarray  # magnetizations of the cells in these fields, shape [3 n, p]
+    patterns: np.ndarray  # magnetizations of the cells in these combinations F, shape [3 n, p]
+    product: np.ndarray  # Q = FᵀRF, shape [p, p]
     uniform: np.ndarray  # magnetizations in unit fields along the axes, shape [3 n, 3]
     balls: np.ndarray  # places of ball magnets, shape [b, 3]
     forces: np.ndarray  # forces of these balls on the cells, in three directions each, shape [3, 3 b]
@@ -130,7 +130,7 @@ def _responses(body, coupling: Coupling) -> list[_Response]:
     ends = np.cumsum([field.shape[1] for field in fields])[:-1]
     *responses, uniform = np.split(_solve(body, coupling, np.hstack(fields)), ends, axis=1)
     return [
-        _Response(distance, places, combinations, cells, patterns, uniform, ball, test.forces(magnetized))
+        _Response(distance, places, combinations, patterns, cells.T @ patterns, uniform, ball, test.forces(magnetized))
         for distance, places, (cells, combinations), patterns, ball, test, magnetized in zip(
             FAR_TO_NEAR, charges, bases, responses[::2], balls, tests, responses[1::2], strict=True
         )
@@ -166,8 +166,13 @@ class _Tests:
 def _fewest_moments(body, response: _Response) -> DistantBody:
     """Return the fewest moments with an error of at most :data:`BALL_ERROR`, or the most that are tried."""
     counts = [count for count in POINT_COUNTS if count < len(body.volumes)]
+    before = None
     for count, edge_weight in itertools.product(counts, _EDGE_WEIGHTS):
-        few, error = _few_moments(body, response, _groups(body.positions, count, edge_weight))
+        group = _groups(body.positions, count, edge_weight)
+        if before is not None and np.array_equal(group, before):
+            continue
+        before = group
+        few, error = _few_moments(body, response, group)
         if error <= BALL_ERROR:
             break
     return replace(few, reach=few.reach * max(1.0, float(np.cbrt(error / BALL_ERROR))))
@@ -185,7 +190,7 @@ def _few_moments(body, response: _Response, group: np.ndarray) -> tuple[DistantB
     left, values, right = np.linalg.svd(fields, full_matrices=False)
     rank = int((values > _LEAST_FIELD * values[0]).sum())
     left, inverse = left[:, :rank], (right[:rank].T / values[:rank]) @ left[:, :rank].T
-    matrix = inverse.T @ response.fields.T @ response.patterns @ inverse
+    matrix = inverse.T @ response.product @ inverse
     matrix = 0.5 * (matrix + matrix.T) + _OTHER_RESPONSE * (np.eye(len(left)) - left @ left.T)
     inverse_response = np.linalg.inv(matrix)
     finite = np.isfinite(inverse_response).all() and np.isfinite(response.patterns).all()
