@@ -33,12 +33,14 @@ AT_TARGETS, AT_POINTS, FIND_CELLS, AT_CELLS, AT_NEIGHBORS, AT_BALLS, ON_CELLS, R
 OF_TARGETS, OF_BALLS, OF_CELLS = range(3)  # kinds of rows; as in ``passes.h``
 _TARGETS_PER_THREAD, _BALLS_PER_THREAD, _CELLS_PER_THREAD = 500, 50, 50
 """Fewest pairs of a source and a target, of a source and a ball, and fewest cells, per thread of a CPU."""
-_PER_ROW, _MOST_ROWS = {OF_TARGETS: 256, OF_BALLS: 8, OF_CELLS: 8}, 64
-"""Fewest targets, balls and cells in a row of a reaction, and most rows of a source."""
+_PER_ROW, _MOST_ROWS, _GPU_ROWS = {OF_TARGETS: 256, OF_BALLS: 8, OF_CELLS: 8}, 64, 16_384
+"""Fewest targets, balls and cells in a row of a reaction, and most rows of a source and of all sources. The last number
+holds for a GPU: on a CPU the sums of a world must not depend on the number of worlds."""
 _GROUP = 32  # threads of a GPU that share a source, or a row of its reaction
-_CELL_GROUP, _CELL_BLOCK = 4, 64
-"""Threads of a GPU that share a cell, and threads of a block. The registers hold fewer blocks if blocks are larger."""
-_CELL_BLOCKS = {wp.float32: 8, wp.float64: 4}
+_CELL_GROUP = 4  # threads of a GPU that share a cell
+_SMALL_BLOCKS, _BLOCK = (AT_CELLS, ON_CELLS, REACT), 64
+"""Passes with many registers, and threads of their blocks. The registers hold fewer blocks if blocks are larger."""
+_BLOCKS = {wp.float32: 8, wp.float64: 4}
 """Such blocks per multiprocessor; limits the registers that compilers use."""
 
 
@@ -53,8 +55,7 @@ def _kernel(dtype, only_pass: int, group: int, coils: bool, solids: bool, cells:
     constants |= dict(zip(("STEEP_REACH_LOW", "STEEP_REACH_HIGH"), near_cells.STEEP_REACH, strict=True))
     constants |= {kind.name: kind.value for kind in SourceKind}
     constants |= dict(zip(("BALLS", "MAGNET_REACH_LOW", "MAGNET_REACH_HIGH", "RESPONSE_ROWS"), balls, strict=True))
-    of_cells = only_pass in (AT_CELLS, ON_CELLS)
-    launch = {"launch_bounds": (_CELL_BLOCK, _CELL_BLOCKS[dtype])} if of_cells else None
+    launch = {"launch_bounds": (_BLOCK, _BLOCKS[dtype])} if only_pass in _SMALL_BLOCKS else None
     return native_kernel(call, "applied/passes.h", arguments, dtype=dtype, launch=launch, **constants)
 
 
@@ -136,11 +137,12 @@ class AppliedField:
             switches = bool(sources.applied), bool(sources.solids_of_copy), self.cell_count > 0, bool(self.rates)
             kernel = _kernel(sources.dtype, *pass_and_group, *switches, self.balls)
             sizes = dict(threads=threads_for(items, share), gpu_threads=group * items)
-            of_cells = dict.fromkeys((FIND_CELLS, AT_CELLS, AT_NEIGHBORS, ON_CELLS), self.arrays.cells.active)
-            active = {AT_TARGETS: self.arrays.targets.active, **of_cells}.get(first)
-            sizes["max_blocks"] = most_blocks(self.device) if active else 0
-            if first in (AT_CELLS, ON_CELLS):
-                sizes["block_dim"] = _CELL_BLOCK
+            cells, targets = self.arrays.cells, self.arrays.targets
+            lists = {AT_TARGETS: targets.active, FIND_CELLS: cells.active, AT_NEIGHBORS: cells.active}
+            lists |= {AT_CELLS: cells.listed, ON_CELLS: cells.listed}
+            sizes["max_blocks"] = most_blocks(self.device) if lists.get(first) else 0
+            if first in _SMALL_BLOCKS:
+                sizes["block_dim"] = _BLOCK
             self._commands[key] = launch_passes(
                 kernel, first, last + 1, self.arrays, device=self.device, record_cmd=True, **sizes
             )
@@ -153,6 +155,8 @@ class AppliedField:
         if self.device.is_cpu:
             self.run_passes(FIND_CELLS, AT_NEIGHBORS, self.cell_count, 1, _CELLS_PER_THREAD)
             return
+        if self.cell_count:
+            self._listed.zero_()
         for number, group in ((FIND_CELLS, 1), (AT_CELLS, _CELL_GROUP), (AT_NEIGHBORS, 1)):
             self.run_passes(number, number, self.cell_count, group, 1)
 
@@ -168,7 +172,7 @@ class AppliedField:
 
     def _launch_at_targets(self):
         """Launch the evaluation at the chunks of targets."""
-        group = group_threads(self.device) if self.sources.solids_of_copy else 1
+        group = group_threads(self.device, moments=self.count) if self.sources.solids_of_copy else 1
         share = _TARGETS_PER_THREAD // max(1, int(np.diff(self.sources.lists).max(initial=0)))
         evaluation = AT_POINTS if self._points else AT_TARGETS
         self.run_passes(evaluation, evaluation, CHUNK * self.arrays.targets.chunk.shape[0], group, max(share, 1))
@@ -283,6 +287,7 @@ class AppliedForces(AppliedField):
         for name in ("body_field", "body_field_x", "body_field_y", "body_field_z"):
             setattr(self.arrays.targets, name, wp.zeros_like(self.field))
         self.cell_count = cells.cell.shape[0]
+        self._listed = cells.listed[:1] if self.device.is_cuda else None
         first_copy = cells.cell[: self.cell_count // copies].numpy()[:, 0]
         edges = np.searchsorted(first_copy, self._world_edges[: sources.world_count // copies])
         self._lay_out_rows(np.append(repeat_rows(edges, copies, len(first_copy)), self.cell_count))
@@ -313,10 +318,13 @@ class AppliedForces(AppliedField):
         world = np.concatenate([np.array([source.world for source in applied], int), sources.solid_worlds])
         is_solid = np.arange(len(world)) >= len(applied)
         in_world = np.where(world >= 0, world, sources.world_count)  # sources of all worlds have no rows
+        most = _MOST_ROWS
+        if self.device.is_cuda:
+            most = min(most, max(1, _GPU_ROWS // max(1, len(world))))
         for kind, edges in edges_of.items():
             first, end = edges[in_world], np.append(edges[1:], edges[-1])[in_world]
             reacts = movable & is_solid if kind == OF_CELLS else movable
-            step = np.maximum(_PER_ROW[kind], -(-(end - first) // _MOST_ROWS))
+            step = np.maximum(_PER_ROW[kind], -(-(end - first) // most))
             source, *ends = cut(first, np.where(reacts, end, first), step)
             parts.append(np.column_stack([source, *ends, np.full(len(source), kind)]))
         rows = np.concatenate(parts)

@@ -192,7 +192,8 @@ CUDA_CALLABLE inline Real3 coarse_differences(const Cell& cell, const CellPoints
         cell.add_mean_field(coarse, 6, k, outer_field(body, cylinder, cell.points(coarse, k)).phi, sums);
     return total_of(sums);
 }
-// Marks cell c as a far one unless a body is near it. A thread does this for one cell: most cells are far.
+// Marks cell c as a far one unless a body is near it, and lists near cells on a GPU. A thread does this for one cell:
+// most cells are far.
 template <class Arrays> CUDA_CALLABLE inline void find_near_bodies(const Arrays& arrays, int c) {
     const Cell cell = cell_at(arrays, c);
     int nearness = FAR_CELL;
@@ -201,6 +202,9 @@ template <class Arrays> CUDA_CALLABLE inline void find_near_bodies(const Arrays&
         if (fade.fine.weight + fade.coarse.weight > 0) nearness = STEEP_CELL;
     }
     arrays.cells.near.data[c] = nearness;
+#if defined(__CUDA_ARCH__)
+    if (nearness != FAR_CELL) arrays.cells.listed.data[1 + atomicAdd(arrays.cells.listed.data, 1)] = c;
+#endif
     if (nearness != FAR_CELL) return;
     put_real3(arrays.cells.change, c, {0, 0, 0});
     put_real3(arrays.cells.steepness, c, {0, 0, 0});

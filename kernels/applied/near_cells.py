@@ -60,6 +60,7 @@ def cell_arrays_type(dtype):
         cell: wp.array[wp.vec4i]  # moment, index of its body in ``rotation``, range of permanent bodies
         factor: wp.array[dtype]  # of the charges on faces of near cells at the last forces (:func:`_image_factor`)
         active: wp.array[int]  # on a GPU the number of cells that are evaluated, then these; None for all
+        listed: wp.array[int]  # on a GPU the number of cells that are not far, then these, shape [cells + 1]
         # Bodies, shape [bodies]:
         rotation: wp.array[quaternion]  # from each body's frame to the world
         grid: wp.array2d[dtype]  # axes of the grid in the body's frame, shape [bodies, 9]
@@ -237,6 +238,8 @@ def _allocate(arrays, count: int, dtype, device):
     arrays.near, arrays.factor, arrays.change, arrays.steepness = (
         wp.zeros(count, dtype=kind, device=device) for kind in (wp.int32, dtype, vec3, vec3)
     )
+    if device.is_cuda:
+        arrays.listed = wp.zeros(1 + count, dtype=wp.int32, device=device)
     # large, and read only where a pass has written it before: zeros would take longer than all else on a CPU
     arrays.potential = wp.empty(count * 6 * FACE_POINTS, dtype=dtype, device=device)
 

@@ -236,15 +236,15 @@ template <class Arrays> CUDA_CALLABLE inline bool has_bodies(const Arrays& array
 }
 
 #if defined(__CUDA_ARCH__)
-// Item ``n`` of the pass: of targets and cells only those whose worlds do not rest, −1 beyond the last.
+// Item ``n`` of the pass, −1 beyond the last: of targets and cells only those whose worlds do not rest, and only cells
+// near a body where these are averaged.
 template <class Arrays> CUDA_CALLABLE inline int listed_item(const Arrays& arrays, int n) {
     if constexpr (PASS == AT_TARGETS) {
         const int chunk = active_item(arrays.targets.active, n / CHUNK);
         return chunk < 0 ? chunk : CHUNK * chunk + n % CHUNK;
     }
-    return PASS == FIND_CELLS || PASS == AT_CELLS || PASS == AT_NEIGHBORS || PASS == ON_CELLS
-               ? active_item(arrays.cells.active, n)
-               : n;
+    if constexpr (PASS == AT_CELLS || PASS == ON_CELLS) return active_item(arrays.cells.listed, n);
+    return PASS == FIND_CELLS || PASS == AT_NEIGHBORS ? active_item(arrays.cells.active, n) : n;
 }
 #endif
 
