@@ -119,11 +119,11 @@ def summary(data: Machines) -> str:
     data = {name: lines for name, lines in data.items() if _cases(lines, "steps")}
     rows = [
         [
-            "step of 1 ms of Balls Up, 243 balls, without eddy currents",
+            "wall time of a time step of 1 ms in the scene Balls Up, 243 balls, without eddy currents",
             *(_time(_cases(x, "steps", scene="balls_up")) for x in data.values()),
         ],
         [
-            "step of 1 ms of Sakura Tree, 2,500 balls",
+            "wall time of a time step of 1 ms in the scene Sakura Tree, 2,500 balls",
             *(_time(_cases(x, "steps", scene="sakura_tree")) for x in data.values()),
         ],
         ["mutual field of balls, all pairs", *map(_against_peers, data.values())],

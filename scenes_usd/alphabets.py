@@ -67,7 +67,7 @@ def author(
         authoring.check_count(name, value)
     count = columns * rows * layers
     stage = authoring.new_stage(
-        f"Alphabets: {count} iron letters fly to an invisible, excessively strong moment in their midst\n\n"
+        f"Alphabets: {count} iron letters fly to an invisible, very strong magnetic moment at their center\n\n"
         "Kim and Han 2022, Fig. 4. No gravity, ordinary friction, steps of 1 ms.",
         seconds=5.0,
     )

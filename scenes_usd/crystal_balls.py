@@ -46,7 +46,7 @@ def author(
     _check(columns, rows, bar, bar_rows, radius, spacing, strength)
     count = columns * rows - bar * bar_rows
     stage = authoring.new_stage(
-        f"Crystal Balls: {count} fixed balls show the field of a bar magnet and of each other\n\n"
+        f"Crystal Balls: {count} fixed balls show the sum of their own fields and the field of a bar magnet\n\n"
         "Kim and Han 2022, Fig. 7. Nothing moves but the magnetizations. Variant set strength: strong, weak.",
         seconds=1.0,
     )

@@ -1,4 +1,4 @@
-"""A coil, a Hall sensor and a voltage hold a steel ball in the air.
+"""A controller holds a steel ball in the air, with a Hall sensor and the voltage of a coil.
 
 The sensor below the coil reads the field of the coil and that of the ball, which the coil magnetizes. The controller
 subtracts the coil's part by the measured current. The rest over the current is a measure of the gap. The current

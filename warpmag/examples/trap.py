@@ -1,4 +1,4 @@
-"""An optimizer turns two magnets by gradients until they trap an iron ball in front of them.
+"""An optimizer turns two magnets by gradients until they trap an iron ball in a plane in front of them.
 
 Müller et al. (arXiv 2511.19201, 2025) turn the magnets of an array so that they hold a millirobot in a plane, 89 mm
 from two magnets. Spacing and strength of the magnets here are not those of the paper. As in Newton's ``diffsim``

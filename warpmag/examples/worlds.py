@@ -1,4 +1,4 @@
-"""1,024 worlds with different currents find the current at which a ball jumps to a coil.
+"""A sweep over 1,024 worlds with different currents determines the current at which a ball jumps to a coil.
 
 The force on an iron ball of volume V on the axis of a solenoid is 3 μ0 V H dH/dz. It exceeds the weight above a
 threshold current, and the worlds bracket this current in one run.
