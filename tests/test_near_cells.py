@@ -13,6 +13,7 @@ import warp as wp
 import warpmag
 from bench import iron
 from bench.reference.iron_bodies import SETUPS, Body, Setup, load
+from bench.reference.magnet_pairs import cylinder_force
 from bench.reference.oracle import MU0
 from tests.cell_bodies import demagnetizing_matrix
 from warpmag.kernels.applied import near_cells
@@ -183,34 +184,48 @@ def test_reaction_on_an_only_magnet_is_that_on_one_among_others(device):
 def test_magnet_in_contact_pulls_right_wherever_the_cells_are(shift, device):
     """The reference is by finite elements at the center of a plate of 80 mm; 2 mm beside it the force is the same.
 
-    The plate keeps its cells; their error is 3 %, that of a magnet's edge among 16 points of a face 4 %.
+    Errors are −2.1 to +1.3 %. The plate keeps its cells.
     """
     name = "magnet μ 1 over iron plate 3, gap 0.02"
     setup, expected = SETUPS[name], load()[name]["forces"][1][2]
     plate, magnet = setup.bodies
     moved = replace(magnet, center=(shift, 0.5 * shift, magnet.center[2]))
     forces, _, _ = iron.model_forces(replace(setup, bodies=(plate, moved)), 0, device, "dipole")
-    assert forces[1, 2] == pytest.approx(expected, rel=0.07)
+    assert forces[1, 2] == pytest.approx(expected, rel=0.03)
 
 
 @pytest.mark.parametrize("gap", ["0.02", "1"])
 def test_fine_cells_of_thick_iron_pull_right(gap, device):
-    """With all of the linear charges of faces the pull was 8 % too strong. Half of them leave 1 and 3 %."""
+    """Errors are −0.6 and 2.3 %. With the charges of isolated faces the pull was up to 4 % too strong."""
     name = f"magnet μ 1 over iron plate 10, gap {gap}"
     forces, _, _ = iron.model_forces(SETUPS[name], 2000, device, "dipole")
-    assert forces[1, 2] == pytest.approx(load()[name]["forces"][1][2], rel=0.05)
+    assert forces[1, 2] == pytest.approx(load()[name]["forces"][1][2], rel=0.03)
+
+
+@pytest.mark.parametrize("half", [(0.04, 0.04, 0.005), (0.05, 0.05, 0.0025)], ids=["80x10", "100x5"])
+@pytest.mark.parametrize(("gap", "limit"), [(2e-5, 0.07), (1e-3, 0.045)])
+def test_wide_plates_pull_like_the_mirror_image(half, gap, limit, device):
+    """Cells are wider than a quarter of the magnet, and the error depends on the position of its edge in them.
+
+    It is −5 to +6 % in contact, and −4 to +2 % at 1 mm. With the charges of isolated faces it was up to 10 %.
+    """
+    expected = cylinder_force(0.01, 0.005, 0.005, 2.0 * gap, REMANENCE / MU0, REMANENCE / MU0)
+    plate = Body("box", half, (0.0, 0.0, -half[2]))
+    for shift in (0.0, 0.0015, 0.0035, 0.005):
+        forces, _, _ = iron.model_forces(with_magnet(plate, (shift, 0.4 * shift), gap), 0, device, "dipole")
+        assert forces[1, 2] == pytest.approx(expected, rel=limit)
 
 
 @pytest.mark.parametrize("permeability", ["1", "1.05"])
 def test_thin_plate_that_is_the_only_iron_pulls_right(permeability, device):
-    """The error is 0.8 %. Beside a ball of iron it is 3.1 %, because Mz has no slope across the plate there.
+    """The error is 1.2 %. Beside a ball of iron it is 3.7 %, because Mz has no slope across the plate there.
 
     A magnet with recoil permeability does not count as iron.
     """
     name = f"magnet μ {permeability} over iron plate 1, gap 1"
     setup, expected = SETUPS[name], load()[name]["forces"][1][2]
     ball = Body("ball", (0.005,), (0.0, 0.0, 0.3))
-    for bodies, limit in ((setup.bodies, 0.01), ((*setup.bodies, ball), 0.04)):
+    for bodies, limit in ((setup.bodies, 0.015), ((*setup.bodies, ball), 0.04)):
         forces, _, _ = iron.model_forces(replace(setup, bodies=bodies), 0, device, "dipole")
         assert forces[1, 2] == pytest.approx(expected, rel=limit)
 
@@ -261,14 +276,13 @@ def test_magnet_that_has_sunk_into_iron_is_still_pulled(depth, device):
 
 def test_charges_of_a_face_have_no_sum():
     """Uniform charges belong to the cells. The response is symmetric, and the energy never positive."""
-    sides = 0.004, 0.003, 0.002
-    for response in face_response(sides, 4):
+    sides, extents = (0.004, 0.003, 0.002), (0.02, 0.02, 0.005)
+    for response in face_response(sides, extents, 4):
         np.testing.assert_allclose(response, response.T, atol=1e-12)
         assert np.abs(response.sum(axis=1)).max() < 1e-12
         assert np.linalg.eigvalsh(response).min() > -1e-12
-    assert (
-        np.abs(face_response(tuple(2.0 * side for side in sides), 4) - 2.0 * face_response(sides, 4)).max() < 1e-12
-    )  # a length
+    twice = face_response(*(tuple(2.0 * length for length in lengths) for lengths in (sides, extents)), 4)
+    np.testing.assert_allclose(twice, 2.0 * face_response(sides, extents, 4), atol=1e-12)  # a length
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ class SystemCells:
         bodies: list[NearCellBody | None] = [None] * len(self._of_one_copy)
         for number, (first, coupling) in enumerate(self._of_one_copy):
             if self._takes_part[number]:
-                response = face_response(tuple(coupling.cell_sides), FACE_SPLIT)
+                response = face_response(tuple(coupling.cell_sides), tuple(coupling.grid_extents), FACE_SPLIT)
                 bodies[number] = NearCellBody(first, coupling, response)
         if any(bodies):
             sources.include_cells(bodies, self.rotations, *self._wrenches)

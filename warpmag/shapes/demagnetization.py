@@ -112,10 +112,15 @@ class Coupling:
         return float(np.linalg.norm(self.positions - self.center, axis=1).max()) or float(self.radii.max())
 
     @cached_property
+    def grid_extents(self) -> np.ndarray:
+        """Extents of the body along the axes of the grid [m], accurate to about half a cell, shape [3]."""
+        local = self.positions @ rotate(self.grid_rotation[None], np.eye(3)).T
+        return np.ptp(local, axis=0) + self.cell_sides
+
+    @cached_property
     def is_sheet(self) -> bool:
         """True for linear cells in one or two layers."""
-        local = self.positions @ rotate(self.grid_rotation[None], np.eye(3)).T
-        return self.slopes is not None and bool((np.ptp(local, axis=0) < 1.5 * self.cell_sides).any())
+        return self.slopes is not None and bool((self.grid_extents < 2.5 * self.cell_sides).any())
 
     def among(self, bodies: int, *, balls: bool) -> "Coupling":
         """Return the coupling in a world with a number of iron bodies of cells, this one included.
