@@ -287,7 +287,7 @@ class AppliedForces(AppliedField):
         for name in ("body_field", "body_field_x", "body_field_y", "body_field_z"):
             setattr(self.arrays.targets, name, wp.zeros_like(self.field))
         self.cell_count = cells.cell.shape[0]
-        self._listed = cells.listed[:1] if self.device.is_cuda else None
+        self._listed = cells.listed[:2] if self.device.is_cuda else None
         first_copy = cells.cell[: self.cell_count // copies].numpy()[:, 0]
         edges = np.searchsorted(first_copy, self._world_edges[: sources.world_count // copies])
         self._lay_out_rows(np.append(repeat_rows(edges, copies, len(first_copy)), self.cell_count))

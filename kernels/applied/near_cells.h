@@ -17,22 +17,23 @@
 
 namespace warpmag {
 
-constexpr int FACE_POINTS = 16, MOST_OUTER = 6 * FACE_POINTS, COARSE_POINTS = 16; // as in near_cells.py
+constexpr int FACE_POINTS = 16, MOST_OUTER = 6 * FACE_POINTS, COARSE_POINTS = 7, COARSE_LENGTH = 16,
+              GAUSS_POINTS = 4; // of other faces and of planes through the center; all as in near_cells.py
 enum Nearness {
     FAR_CELL,
     STEEP_CELL,
     NEAR_CELL
 }; // fields: at the center, with differences, averaged; as in near_cells.py
 
-// Points of a cell whose half sides are 1, and charges at them, shape [9, count] (near_cells.py). The first ``outer``
-// are on outer faces.
+// Points of a cell whose half sides are 1, and charges at them, shape [9, length] (near_cells.py). The first ``count``
+// are not padding, and the first ``outer`` are on outer faces.
 struct CellPoints {
     const Real* data;
-    int count, outer;
-    CUDA_CALLABLE const Real* row(int row, int k) const { return data + row * count + k; }
+    int length, count, outer;
+    CUDA_CALLABLE const Real* row(int row, int k) const { return data + row * length + k; }
 };
 template <class Arrays> CUDA_CALLABLE inline CellPoints coarse_points(const Arrays& arrays) {
-    return {arrays.cells.point.data, COARSE_POINTS, 0};
+    return {arrays.cells.point.data, COARSE_LENGTH, COARSE_POINTS, 0};
 }
 
 // A cell in the world. The axes are those of its grid; ``outer`` has a bit for each face on the surface of the body.
@@ -93,8 +94,11 @@ template <class Arrays> CUDA_CALLABLE inline Cell cell_at(const Arrays& arrays, 
                  row[3],
                  form[0],
                  arrays.cells.response.data + (size_t)form[1] * (3 * FACE_POINTS * FACE_POINTS),
-                 {arrays.cells.point.data + form[2], form[3], 0}};
-    for (int face = 0; face < 6; ++face) cell.fine.outer += form[0] >> face & 1 ? FACE_POINTS : 0;
+                 {arrays.cells.point.data + form[2], form[3], 9 * GAUSS_POINTS, 0}};
+    for (int face = 0; face < 6; ++face) {
+        cell.fine.outer += form[0] >> face & 1 ? FACE_POINTS : 0;
+        cell.fine.count += form[0] >> face & 1 ? FACE_POINTS - GAUSS_POINTS : 0;
+    }
     for (int a = 0; a < 3; ++a) {
         cell.axes[a] = grid[3 * a] * body.x + grid[3 * a + 1] * body.y + grid[3 * a + 2] * body.z;
         cell.size = cell.half[a] > Real(0.5) * cell.size ? 2 * cell.half[a] : cell.size;
@@ -192,20 +196,34 @@ CUDA_CALLABLE inline Real3 coarse_differences(const Cell& cell, const CellPoints
         cell.add_mean_field(coarse, 6, k, outer_field(body, cylinder, cell.points(coarse, k)).phi, sums);
     return total_of(sums);
 }
+#if defined(__CUDA_ARCH__)
+// The ``n``-th cell near a body, −1 beyond the last. The list has the numbers of cells with averages and of those with
+// differences alone, then the former from its begin and the latter from its end: threads of a warp do the same work.
+template <class List> CUDA_CALLABLE inline int listed_cell(const List& listed, int n) {
+    const int averaged = listed.data[0], others = listed.data[1];
+    if (n < averaged) return listed.data[2 + n];
+    return n < averaged + others ? listed.data[listed.shape[0] - 1 - (n - averaged)] : -1;
+}
+template <class List> CUDA_CALLABLE inline void list_cell(const List& listed, int c, bool averaged) {
+    const int place = atomicAdd(listed.data + (averaged ? 0 : 1), 1);
+    listed.data[averaged ? 2 + place : listed.shape[0] - 1 - place] = c;
+}
+#endif
 // Marks cell c as a far one unless a body is near it, and lists near cells on a GPU. A thread does this for one cell:
 // most cells are far.
 template <class Arrays> CUDA_CALLABLE inline void find_near_bodies(const Arrays& arrays, int c) {
     const Cell cell = cell_at(arrays, c);
-    int nearness = FAR_CELL;
+    Real fine = 0, all = 0;
     for (int b = cell.first; b < cell.last; ++b) {
         const CellFades fade = cell_fades(cell, body_at(arrays, b));
-        if (fade.fine.weight + fade.coarse.weight > 0) nearness = STEEP_CELL;
+        fine += fade.fine.weight;
+        all += fade.fine.weight + fade.coarse.weight;
     }
-    arrays.cells.near.data[c] = nearness;
+    arrays.cells.near.data[c] = all > 0 ? STEEP_CELL : FAR_CELL;
 #if defined(__CUDA_ARCH__)
-    if (nearness != FAR_CELL) arrays.cells.listed.data[1 + atomicAdd(arrays.cells.listed.data, 1)] = c;
+    if (all > 0) list_cell(arrays.cells.listed, c, fine > 0);
 #endif
-    if (nearness != FAR_CELL) return;
+    if (all > 0) return;
     put_real3(arrays.cells.change, c, {0, 0, 0});
     put_real3(arrays.cells.steepness, c, {0, 0, 0});
 }

@@ -18,7 +18,7 @@ from warpmag.kernels.shared.reductions import most_blocks
 
 FACE_SPLIT = 4  # squares along each side of a face
 FACE_POINTS = FACE_SPLIT**2  # points of a face; as in ``near_cells.h``
-COARSE_POINTS = 16  # points of a cell for differences at a distance, and padding; as in ``near_cells.h``
+COARSE_LENGTH = 16  # points of a cell for differences at a distance, and padding; as in ``near_cells.h``
 _WIDEST = 16  # numbers of points are multiples of it, the longest vector of a CPU
 NEAR = 2  # value of ``near`` of cells over which fields are averaged; as in ``near_cells.h``
 CELL_REACH = 0.75, 1.25
@@ -60,7 +60,7 @@ def cell_arrays_type(dtype):
         cell: wp.array[wp.vec4i]  # moment, index of its body in ``rotation``, range of permanent bodies
         factor: wp.array[dtype]  # of the charges on faces of near cells at the last forces (:func:`_image_factor`)
         active: wp.array[int]  # on a GPU the number of cells that are evaluated, then these; None for all
-        listed: wp.array[int]  # on a GPU the number of cells that are not far, then these, shape [cells + 1]
+        listed: wp.array[int]  # on a GPU the cells near a body (``listed_cell`` in near_cells.h), shape [cells + 2]
         # Bodies, shape [bodies]:
         rotation: wp.array[quaternion]  # from each body's frame to the world
         grid: wp.array2d[dtype]  # axes of the grid in the body's frame, shape [bodies, 9]
@@ -92,9 +92,9 @@ def coarse_points() -> np.ndarray:
     """Return points of a cell for differences at a distance: the centers of its faces, and of itself.
 
     Rows are the positions in a cube of half side 1, the charges by moments along the axes, which are 0 here, and those
-    by differences of the halves along the axes, shape [9, COARSE_POINTS].
+    by differences of the halves along the axes, shape [9, COARSE_LENGTH].
     """
-    points = np.zeros((9, COARSE_POINTS))
+    points = np.zeros((9, COARSE_LENGTH))
     for face in range(6):
         axis = face // 2
         points[axis, face], points[6 + axis, face] = 2.0 * (face % 2) - 1.0, 1.0
@@ -155,7 +155,7 @@ def _table(coupling, kind: int, scalar) -> dict[str, np.ndarray]:
 
 def _points_of(tables: Sequence[dict[str, np.ndarray]]) -> np.ndarray:
     """Return the coarse points, then the fine points of each kind of outer faces, and refer to them in the forms."""
-    parts, first = [coarse_points()], 9 * COARSE_POINTS
+    parts, first = [coarse_points()], 9 * COARSE_LENGTH
     forms = [table["form"] for table in tables]
     for outer in np.unique(np.concatenate([form[:, 0] for form in forms])):
         parts.append(fine_points(int(outer)))
@@ -239,7 +239,7 @@ def _allocate(arrays, count: int, dtype, device):
         wp.zeros(count, dtype=kind, device=device) for kind in (wp.int32, dtype, vec3, vec3)
     )
     if device.is_cuda:
-        arrays.listed = wp.zeros(1 + count, dtype=wp.int32, device=device)
+        arrays.listed = wp.zeros(2 + count, dtype=wp.int32, device=device)
     # large, and read only where a pass has written it before: zeros would take longer than all else on a CPU
     arrays.potential = wp.empty(count * 6 * FACE_POINTS, dtype=dtype, device=device)
 

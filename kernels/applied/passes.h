@@ -243,7 +243,7 @@ template <class Arrays> CUDA_CALLABLE inline int listed_item(const Arrays& array
         const int chunk = active_item(arrays.targets.active, n / CHUNK);
         return chunk < 0 ? chunk : CHUNK * chunk + n % CHUNK;
     }
-    if constexpr (PASS == AT_CELLS || PASS == ON_CELLS) return active_item(arrays.cells.listed, n);
+    if constexpr (PASS == AT_CELLS || PASS == ON_CELLS) return listed_cell(arrays.cells.listed, n);
     return PASS == FIND_CELLS || PASS == AT_NEIGHBORS ? active_item(arrays.cells.active, n) : n;
 }
 #endif
