@@ -204,9 +204,10 @@ template <class List> CUDA_CALLABLE inline int listed_cell(const List& listed, i
     if (n < averaged) return listed.data[2 + n];
     return n < averaged + others ? listed.data[listed.shape[0] - 1 - (n - averaged)] : -1;
 }
+// The compiler makes one atomic addition for a warp only where all its threads add to one number.
 template <class List> CUDA_CALLABLE inline void list_cell(const List& listed, int c, bool averaged) {
-    const int place = atomicAdd(listed.data + (averaged ? 0 : 1), 1);
-    listed.data[averaged ? 2 + place : listed.shape[0] - 1 - place] = c;
+    if (averaged) listed.data[2 + atomicAdd(listed.data, 1)] = c;
+    else listed.data[listed.shape[0] - 1 - atomicAdd(listed.data + 1, 1)] = c;
 }
 #endif
 // Marks cell c as a far one unless a body is near it, and lists near cells on a GPU. A thread does this for one cell:
