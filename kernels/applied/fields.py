@@ -34,14 +34,14 @@ OF_TARGETS, OF_BALLS, OF_CELLS = range(3)  # kinds of rows; as in ``passes.h``
 _TARGETS_PER_THREAD, _BALLS_PER_THREAD, _CELLS_PER_THREAD = 500, 50, 50
 """Fewest pairs of a source and a target, of a source and a ball, and fewest cells, per thread of a CPU."""
 _PER_ROW, _MOST_ROWS, _GPU_ROWS = {OF_TARGETS: 256, OF_BALLS: 8, OF_CELLS: 8}, 64, 16_384
-"""Fewest targets, balls and cells in a row of a reaction, and most rows of a source and of all sources. The last number
-holds for a GPU: on a CPU the sums of a world must not depend on the number of worlds."""
+"""Smallest number of targets, balls or cells in a row of a reaction, and largest numbers of rows of one source, and of
+all sources. The last number is for GPUs: on a CPU the sums of a world must not depend on the number of worlds."""
 _GROUP = 32  # threads of a GPU that share a source, or a row of its reaction
 _CELL_GROUP = 4  # threads of a GPU that share a cell
 _SMALL_BLOCKS, _BLOCK = (AT_CELLS, ON_CELLS, REACT), 64
-"""Passes with many registers, and threads of their blocks. The registers hold fewer blocks if blocks are larger."""
+"""Passes whose kernels need many registers, and threads per block: larger blocks lower the occupancy."""
 _BLOCKS = {wp.float32: 8, wp.float64: 4}
-"""Such blocks per multiprocessor; limits the registers that compilers use."""
+"""Smallest number of these blocks per multiprocessor, for ``launch_bounds``: it limits the registers per thread."""
 
 
 @cache

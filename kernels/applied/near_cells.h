@@ -2,14 +2,14 @@
 //
 // The field at a cell's center does not represent a cell near the edge of a magnet, where the field varies over less
 // than a cell. There the average of the field over the cell is taken, H̄ = −Σ n φ̄ A/V over its faces, with the
-// mean potential φ̄ of points of a face. A face on the body's surface in front of a magnet has charges that vary over
-// less than a cell, too. They respond with q = −R φ to the potentials φ at FACE_POINTS points, less that of the average
-// field, and have the energy −½ μ0 φᵀ R φ. Python computes R (``warpmag.shapes.face_charges``); it leaves out uniform
-// charges.
+// mean potential φ̄ of points of a face. A face on the surface of the iron body in front of a magnet has charges that
+// vary over less than a cell, too. They are q = −R φ at FACE_POINTS points. Here φ is the potential of the magnet minus
+// that of its average field. The energy of the charges is −½ μ0 φᵀ R φ. Python computes R
+// (``warpmag.shapes.face_charges``); it leaves out uniform charges.
 //
-// Both fade with the distance of a cell from the body, in longest sides of the cell. Forces are the derivatives of the
-// energy at constant permeability of the cell. Takes CELL_REACH_LOW, CELL_REACH_HIGH, STEEP_REACH_LOW and
-// STEEP_REACH_HIGH from Python. ``Arrays`` is the struct of sources.py.
+// Averages and charges fade with the distance of a cell from the magnet, in longest sides of the cell. Forces are minus
+// the derivatives of the energy at constant permeability of the cell. Takes CELL_REACH_LOW, CELL_REACH_HIGH,
+// STEEP_REACH_LOW and STEEP_REACH_HIGH from Python. ``Arrays`` is the struct of sources.py.
 #pragma once
 #include "applied/cylinder.h"
 #include "applied/target_field.h"
@@ -197,8 +197,9 @@ CUDA_CALLABLE inline Real3 coarse_differences(const Cell& cell, const CellPoints
     return total_of(sums);
 }
 #if defined(__CUDA_ARCH__)
-// The ``n``-th cell near a body, −1 beyond the last. The list has the numbers of cells with averages and of those with
-// differences alone, then the former from its begin and the latter from its end: threads of a warp do the same work.
+// The ``n``-th cell near a body, −1 beyond the last. The list starts with two counts: of cells with averages, and of
+// cells with differences alone. Cells with averages follow. The others are stored from the end of the list backward.
+// So the threads of a warp do the same work.
 template <class List> CUDA_CALLABLE inline int listed_cell(const List& listed, int n) {
     const int averaged = listed.data[0], others = listed.data[1];
     if (n < averaged) return listed.data[2 + n];
@@ -210,8 +211,8 @@ template <class List> CUDA_CALLABLE inline void list_cell(const List& listed, in
     else listed.data[listed.shape[0] - 1 - atomicAdd(listed.data + 1, 1)] = c;
 }
 #endif
-// Marks cell c as a far one unless a body is near it, and lists near cells on a GPU. A thread does this for one cell:
-// most cells are far.
+// Marks cell c as a far one unless a body is near it, and lists near cells on a GPU. A single thread does this for a
+// cell, not a group of threads, because most cells are far.
 template <class Arrays> CUDA_CALLABLE inline void find_near_bodies(const Arrays& arrays, int c) {
     const Cell cell = cell_at(arrays, c);
     Real fine = 0, all = 0;

@@ -33,12 +33,12 @@ from warpmag.shapes.demagnetization import Coupling, full_tensors, pair_law_tens
 from warpmag.shapes.uniform_response import cell_matrix
 
 FAR_TO_NEAR = 0.6, 0.3, 0.15
-"""Smallest distance of each level from the body's box, which is that of the surface of charges, in longest sides of the
-box."""
+"""Smallest distance at which each level is used, from the body's box to the surface of charges, in longest sides of
+the box."""
 BALL_ERROR = 0.025
 """Largest relative error of the force of a ball magnet at the smallest distance of a level."""
 POINT_COUNTS = 8, 9, 12, 16, 20, 25, 36, 49, 64, 81, 100, 125, 144, 196
-"""Largest numbers of points that are tried at a level."""
+"""Upper limits of the number of points, tried in this order at each level."""
 LEAST_REPLACED_CELLS = 65
 """Smallest number of cells of a body that few moments replace."""
 MOST_REPLACED_CELLS = 1000
@@ -84,9 +84,9 @@ class DistantBody:
 
 
 def distant_bodies(body, coupling: Coupling) -> list[DistantBody] | None:
-    """Return the few moments of a body at each level, or None if rounding leaves no response.
+    """Return the few moments of a body at each level, or None if rounding errors leave no positive response.
 
-    A level is left out if it has more than three quarters of the moments of the next one, or of the cells.
+    A level is left out if it has more than three quarters of the moments of the nearer level, or of the cells.
 
     Args:
         body: The cells, with ``positions`` [m], ``volumes`` [m³] and ``radii`` [m].
@@ -115,7 +115,7 @@ class _Response:
     product: np.ndarray  # Q = FᵀRF, shape [p, p]
     uniform: np.ndarray  # magnetizations in unit fields along the axes, shape [3 n, 3]
     balls: np.ndarray  # places of ball magnets, shape [b, 3]
-    forces: np.ndarray  # forces of these balls on the cells, in three directions each, shape [3, 3 b]
+    forces: np.ndarray  # forces on the cells by these balls, magnetized along x, y and z in turn, shape [3, 3 b]
 
 
 def _responses(body, coupling: Coupling) -> list[_Response]:
@@ -225,9 +225,9 @@ def _volumes(shares: np.ndarray, few: np.ndarray, cells: np.ndarray) -> np.ndarr
     uniform = volume * np.sqrt(squares) / np.sqrt(squares).sum()
     low, high = 0.0, 1.0
     for _ in range(20):
-        share = 0.5 * (low + high)
-        volumes = shares + share * (uniform - shares)
-        low, high = (share, high) if (squares / volumes).sum() * volume > goal else (low, share)
+        weight = 0.5 * (low + high)
+        volumes = shares + weight * (uniform - shares)
+        low, high = (weight, high) if (squares / volumes).sum() * volume > goal else (low, weight)
     return volumes
 
 

@@ -1,18 +1,21 @@
 """Charges on a flat face of iron that vary over less than a cell, and their response to a potential.
 
-Cells are uniformly magnetized, so the charges of their faces are uniform. In front of the edge of a magnet the charge
-of an iron face varies over less than a cell. Without this variation a magnet in contact pulls up to 30 % too weakly.
+The normal component of the magnetization is uniform over each face of a cell, so the charges of the faces are uniform.
+In front of the edge of a magnet the charge of an iron face varies over less than a cell. Without this variation a
+magnet in contact pulls up to 30 % too weakly.
 
-A face therefore has additional charges q on equal rectangles, in response to the potential φ there. Cells keep the
-average field of each cell near 0, so φ is the potential minus that of the average field. The surface of a half-space of
-ideal permeability stays at one potential: a potential cos kx induces the charge density −2 k cos kx. So q is
+A face therefore has additional charges q on equal rectangles. They respond to φ, the potential of the magnet there
+minus the potential of its field averaged over the cell: the magnetization of the cell already responds to this average.
+The surface of a half-space of ideal permeability stays at one potential: a potential cos kx induces the charge density
+−2 k cos kx. So q is
 
     q = −R φ,      R = A Σ w 2k c cᵀ
 
-with the area A of a rectangle. The sum is over cosines c along the two sides of the face, normalized on the rectangles,
-that have n and m half waves: cos πnx/l cos πmy/l', k = π √(n²/l² + m²/l'²). It leaves out n = m = 0, because the sum
-of q over a face is 0: uniform charges belong to the cells. The energy is −½ μ0 φᵀ R φ. For a body of finite
-susceptibility χ, R is multiplied by χ/(χ + 2), as for a half-space.
+with the area A of a rectangle and weights w. The sum is over products of two cosines, one along each side of the face:
+c = cos πnx/l cos πmy/l' with n and m half waves, normalized on the rectangles. The wave number is
+k = π √(n²/l² + m²/l'²). The sum leaves out n = m = 0, because the sum of q over a face is 0: uniform charges belong to
+the cells. The energy is −½ μ0 φᵀ R φ. For finite permeability R is multiplied by a factor (``kernels/applied``). In a
+body of several layers of cells with constant χ it is χ/(χ + 2), as for a half-space.
 
 The weights w account for three effects. The charges of the cells partly follow φ already, from face to face. The
 charges of neighboring faces act on each other. And the charges vary over less than a rectangle, too. The weights are
@@ -26,16 +29,16 @@ from functools import cache
 import numpy as np
 
 _LINEAR, _EVEN, _OTHER = 0.9, 0.6, 2.2
-"""Weights of cosines of one half wave along a side as long as the body is thick, of even numbers n and m, and of other
-numbers. The first is proportional to √(l/t) with the thickness t of the body behind the face: in a thin plate a cell is
-wide relative to its depth, and its charges follow φ less."""
+"""Weights of cosines with one half wave along a side l and none along the other, for l equal to the thickness t of the
+body behind the face; of cosines with even n and even m; and of all others. The first weight is proportional to √(l/t):
+in a thin plate a cell is wide relative to its depth, and its charges follow φ less."""
 
 
 @cache
 def face_response(sides: tuple[float, float, float], extents: tuple[float, float, float], split: int) -> np.ndarray:
-    """Return the responses R [m] of a cuboid's faces normal to x, y and z, shape [3, split², split²].
+    """Return the responses R [m] of a cell's faces normal to x, y and z, shape [3, split², split²].
 
-    ``sides`` are the sides of the cuboid and ``extents`` those of the body around it [m]. A face has ``split``
+    ``sides`` are the sides of the cell and ``extents`` those of the body along the same axes [m]. A face has ``split``
     rectangles along each side. Of the two axes of a face the later one varies fastest.
 
     Example:
